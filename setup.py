@@ -11,7 +11,7 @@ SHIPPED = ("Snakefile", "workflow", "configs", "profiles", "data/demo")
 
 
 class BuildWithShippedFiles(build_py):
-    """Adds ``pipeline/shipped`` to what is built; an editable installation reads the repository itself."""
+    """Adds ``pipeline/shipped`` and ``imu_logs/profiles``; an editable installation reads the repository itself."""
 
     def run(self) -> None:
         """Build the package, then copy the files."""
@@ -27,6 +27,7 @@ class BuildWithShippedFiles(build_py):
             else:
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(source, copy)
+        shutil.copytree(ROOT / "configs" / "ingest", Path(self.build_lib, "imu_logs", "profiles"), dirs_exist_ok=True)
 
 
 setup(cmdclass={"build_py": BuildWithShippedFiles})

@@ -79,7 +79,7 @@ def write_mcap(path: Path, samples: int) -> None:
     """Write what a recorder writes: quantised readings in zstd chunks, and a temperature ten times a second."""
     from mcap.writer import Writer  # noqa: PLC0415
 
-    from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE, as_messages, imu_table  # noqa: PLC0415
+    from imu_logs.mcap_write import DEFINITIONS, IMU, TEMPERATURE, as_messages, imu_table  # noqa: PLC0415
 
     generator = np.random.default_rng(1)
     with path.open("wb") as stream:
@@ -127,9 +127,13 @@ def mcap_unchanged(log: Path, out: Path, _calibration: Path) -> int:
     from mcap.opcode import Opcode  # noqa: PLC0415
     from mcap.records import Chunk  # noqa: PLC0415
 
-    from pipeline.io.mcap_chunk import RECORD_HEAD, bytes_of, parsed  # noqa: PLC0415
-    from pipeline.io.mcap_copy import McapCopy  # noqa: PLC0415
-    from pipeline.io.mcap_reader import McapReader  # noqa: PLC0415
+    from imu_logs.mcap_file import (  # noqa: PLC0415  (only where it is needed)
+        RECORD_HEAD,
+        McapReader,
+        bytes_of,
+        parsed,
+    )
+    from imu_logs.mcap_write import McapCopy  # noqa: PLC0415
 
     with log.open("rb") as stream, out.open("wb") as target:
         reader, copy = McapReader(stream, str(log)), McapCopy(target)

@@ -52,15 +52,15 @@ def write_log(path: Path, rows: int) -> None:
 
 
 def read_ours(path: Path) -> tuple[int, list[float]]:
-    from pipeline.io.csv_read import read_csv  # noqa: PLC0415  (a process loads its own reader only)
-    from pipeline.io.ingest_settings import csv_formats  # noqa: PLC0415
+    from imu_logs.profile import csv_formats  # noqa: PLC0415
+    from imu_logs.text_read import read_csv  # noqa: PLC0415  (a process loads its own reader only)
 
     table = read_csv([path], csv_formats(yaml.safe_load(PROFILE.read_text())))
     return len(table.time_ns), [float(table.time_ns[-1]) / 1e9, *(float(v[-1]) for v in table.values.values())]
 
 
 def read_marked(path: Path) -> tuple[int, list[float]]:
-    from pipeline.io.ingest_settings import Checks  # noqa: PLC0415
+    from imu_logs.profile import Checks  # noqa: PLC0415
     from pipeline.io.read import read_table, to_recording  # noqa: PLC0415
 
     ingest = yaml.safe_load(PROFILE.read_text())
@@ -99,7 +99,7 @@ def measure(reader: str, path: Path) -> dict[str, float]:
 def read_once(reader: str, path: Path) -> None:
     if reader != "bare":
         importlib.import_module("pipeline.io.read")
-        importlib.import_module("pipeline.io.csv_read")
+        importlib.import_module("imu_logs.text_read")
     start = time.process_time()
     count, last = READERS[reader](path)
     cpu = time.process_time() - start

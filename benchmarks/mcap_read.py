@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from pipeline.io.ros2_messages import DEFINITIONS, IMU
+from imu_logs.mcap_write import DEFINITIONS, IMU
 
 CHUNK = 1 << 20  # bytes
 LSB = 1 / 16384
@@ -51,8 +51,8 @@ def write_log(path: Path, messages: int, compression: CompressionType) -> None:
 
 
 def read_ours(path: Path, _messages: int) -> tuple[int, list[float]]:
-    from pipeline.io.ingest_settings import McapFormat  # noqa: PLC0415
-    from pipeline.io.mcap import read_log  # noqa: PLC0415  (a process loads its own reader only)
+    from imu_logs.message_read import read_log  # noqa: PLC0415  (a process loads its own reader only)
+    from imu_logs.profile import McapFormat  # noqa: PLC0415
 
     table = read_log(path, McapFormat())
     return len(table.time_ns), [float(v[:1000].sum()) for v in table.values.values()]
@@ -85,7 +85,7 @@ def measure(reader: str, path: Path, messages: int) -> dict[str, float]:
 
 def read_once(reader: str, path: Path, messages: int) -> None:
     read = {"ours": read_ours, "official": read_official}[reader]
-    importlib.import_module({"ours": "pipeline.io.mcap", "official": "mcap_ros2.reader"}[reader])
+    importlib.import_module({"ours": "imu_logs.message_read", "official": "mcap_ros2.reader"}[reader])
     start = time.process_time()
     count, sums = read(path, messages)
     cpu = time.process_time() - start

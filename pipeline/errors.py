@@ -13,81 +13,23 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from imu_logs.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, InputError, MissingInputError
+from imu_logs.errors import UserError as PipelineError
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-
-UNKNOWN_LAYOUT = ("missing_column", "no_header", "missing_topic")  # codes of logs that a profile does not describe
-
-
-class PipelineError(Exception):
-    """A user error: ``message``, and ``file`` as ``path`` or ``path:line``."""
-
-    code: str = "error"
-
-    def __init__(self, message: str, file: str | None = None) -> None:
-        super().__init__(message)
-        self.message = message
-        self.file = file
-
-    def __str__(self) -> str:
-        return f"{self.file}: {self.message}" if self.file else self.message
-
-
-class InputError(PipelineError):
-    """A recording or another input file cannot be used."""
-
-    code = "bad_input"
-
-
-class IngestError(InputError):
-    """A recording cannot be used.
-
-    Parameters
-    ----------
-    message : str
-        What is wrong and where, with the facts.
-    code : str
-        A code of ``docs/bad_inputs.md``: ``not_a_number``, ``wrong_sense`` ...
-    offset : int, optional
-        Byte of the file at which the error was found.
-    hint : str
-        What the user can do.
-
-    Attributes
-    ----------
-    fact : str
-        The message without byte and hint.
-    sessions : int
-        Number of parts of a log whose logger was restarted.
-    """
-
-    sessions: int = 0
-
-    def __init__(
-        self, message: str, file: str | None = None, *, code: str = "damaged", offset: int | None = None, hint: str = ""
-    ) -> None:
-        place = "" if offset is None else f" (byte {offset})"
-        super().__init__(f"{message}{place}" + (f"; {hint}" if hint else ""), file)
-        self.code, self.fact = code, message
-
-
-class MissingInputError(InputError):
-    """A file that the procedure needs does not exist."""
-
-    code = "missing_file"
+__all__ = [
+    "UNKNOWN_LAYOUT", "CannotCalibrateError", "ConfigurationError", "ConvergenceError", "DamagedFileError",
+    "IngestError", "InputError", "InternalError", "MissingInputError", "NotObservableError", "PipelineError",
+    "as_published", "failure_of", "first", "is_of_run", "omission",
+]  # fmt: skip
 
 
 class DamagedFileError(InputError):
     """A file that an earlier stage wrote is damaged or missing; the same command run again writes it."""
 
     code = "damaged_file"
-
-
-class ConfigurationError(PipelineError):
-    """A setting is unknown, of the wrong type or out of its range."""
-
-    code = "bad_configuration"
 
 
 class NotObservableError(PipelineError):

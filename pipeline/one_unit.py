@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import scipy.linalg  # noqa: F401  (loads its library of linear algebra, so that ``environment`` limits its threads)
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
+from imu_logs import CANONICAL_CSV, load_profile
 from pipeline.config.campaign import Campaign, UnitRow, cut_batches
 from pipeline.config.compose import Composer
 from pipeline.config.layers import as_list, key_of
@@ -22,7 +23,7 @@ from pipeline.config.stage_settings import as_job_reads, settings_in_memory
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, PipelineError, as_published, failure_of
 from pipeline.io.files import candidate_files, wrong_name
-from pipeline.io.read import IN_MEMORY, canonical, of_one_sensor, tried
+from pipeline.io.read import IN_MEMORY, of_one_sensor, tried
 from pipeline.model.effects import registered
 from pipeline.outcome import run_command
 from pipeline.settings import UserEffectFiles
@@ -254,7 +255,7 @@ def _of_mapping(row: UnitRow, recordings: Any) -> tuple[UnitRow, UnitFiles]:  # 
     frames = {n: _text_of(n, r) for n, r in recordings.items() if not isinstance(r, str | os.PathLike)}
     paths = {n: str(Path(r).resolve()) for n, r in recordings.items() if n not in frames}
     columns = row.config.ingest.csv.get("columns")
-    if frames and not paths and columns and columns != canonical().csv["columns"]:
+    if frames and not paths and columns and columns != load_profile(CANONICAL_CSV).csv["columns"]:
         message = "describes columns of files; a DataFrame has those of the canonical CSV: leave out the setting"
         raise ConfigurationError(f"ingest={row.config.ingest.name} {message} of ingest")
     entries = {n: e.replaced(file=paths.get(n, e.file)) for n, e in known.items() if n in recordings}
@@ -274,7 +275,7 @@ def _text_of(name: str, recording: Any) -> bytes:  # noqa: ANN401  (the user's)
     """Return a DataFrame as canonical CSV; raises ``InputError`` for any other object."""
     import pandas as pd  # noqa: PLC0415  (0.4 s, for DataFrames only)
 
-    from pipeline.io.data_frame import canonical_csv  # noqa: PLC0415  (likewise)
+    from imu_logs.text_write import canonical_csv  # noqa: PLC0415  (likewise)
 
     if not isinstance(recording, pd.DataFrame):
         kind = type(recording).__name__

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from imu_logs.units import CANONICAL, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.errors import InputError
 from pipeline.files import write_atomically
-from pipeline.io.channel_table import in_body_axes, maps_of_log
-from pipeline.io.units import CANONICAL, SECOND_NS, SINCE_1970_NS, TRIADS
+from pipeline.io.axis_maps import in_body_axes, maps_of_log
 from pipeline.model.compensation import Compensation, compensation_of
 from pipeline.pack import as_bytes
 from pipeline.records import SENSOR_UNITS, SENSORS, Values

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, Self, TypeVa
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from imu_logs.profile import Profile
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
@@ -304,18 +306,8 @@ class LimitsOfSensors(OfSensors[SensorLimits]):
     """The limits of each sensor."""
 
 
-class Ingest(Section):
-    """The format of recordings; ``pipeline.io`` documents the keys of ``csv``, ``mcap`` and ``checks``.
-
-    ``instance`` selects a sensor in a log of several sensors; names in ``csv`` and ``mcap`` refer to it. A profile of
-    text logs needs no ``mcap``, a profile of message logs no ``csv``.
-    """
-
-    name: str
-    instance: str | int | None = None
-    csv: dict[str, Any] = {}
-    mcap: dict[str, Any] = {}
-    checks: dict[str, Any] = {}
+class Ingest(Section, Profile):
+    """The format of recordings (``imu_logs.Profile``)."""
 
 
 Text = Annotated[str, Field(min_length=1)] | None

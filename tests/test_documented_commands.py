@@ -71,7 +71,7 @@ NOT_RUN = {  # by the start of the command, and why
 }
 NOT_RUN_IN = {
     "find_the_missing_effect.md": "test_tutorial.py",
-    "formats.md": "needs a log of a PX4 board; tests/io read such",
+    "formats.md": "needs a log of a PX4 board; tests/imu_logs read such",
 }
 LONG = ("snakemake --cores 2 --config campaign=thesis",)  # planned, as it simulates and fits for minutes
 

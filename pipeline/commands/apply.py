@@ -6,11 +6,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from imu_logs.files import MESSAGE_FORMATS
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.field_logs.compensate import LogProfile, compensate_log, require_apart
 from pipeline.files import CONFIGS
-from pipeline.io.files import MESSAGE_FORMATS
 from pipeline.model.calibration_file import read_calibration
 from pipeline.model.compensation import SMOOTHING_S, load
 from pipeline.run_progress import Countdown

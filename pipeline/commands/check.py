@@ -12,22 +12,22 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
+from imu_logs.files import SUFFIXES
+from imu_logs.guesses import TO_DECIDE
+from imu_logs.proposal import as_yaml, layouts_of, not_found
 from pipeline.commands import parser_of
 from pipeline.commands.readings import Reading, campaign_of, config_of_log, grouped, recordings_of_files
 from pipeline.config.campaign import find_campaign, load_campaign
 from pipeline.config.options import nearest
 from pipeline.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, first
 from pipeline.files import write_atomically
-from pipeline.io.files import FILE, SUFFIXES, recording_files
+from pipeline.io.files import FILE, recording_files
 from pipeline.model.calibration_file import LEFT_OUT_REASONS
 from pipeline.model.sensor_file import settings_of_ranges
 from pipeline.one_unit import try_unit, unit_of_campaign
 from pipeline.outcome import NAMED_PER_LINE, as_overrides, found_mountings
-from pipeline.profile_detection.columns import find_layout
-from pipeline.profile_detection.profile_text import as_yaml, not_found
-from pipeline.profile_detection.proposal import propose
-from pipeline.profile_detection.recording_facts import as_text, counted, facts, topic_lines, topics_of
-from pipeline.profile_detection.unit_guesses import TO_DECIDE
+from pipeline.profile_detection.recording_facts import as_text, counted, facts, topic_lines
+from pipeline.profile_detection.unit_guesses import propose
 from pipeline.records import SENSORS
 from pipeline.run_progress import Countdown
 from pipeline.settings import Ingest
@@ -36,15 +36,14 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Mapping, Sequence
 
+    from imu_logs.columns import UnknownLog
+    from imu_logs.proposal import Proposal
     from pipeline.config.campaign import Campaign
     from pipeline.outcome import FoundMounting, Ways
-    from pipeline.profile_detection.columns import Log
-    from pipeline.profile_detection.proposal import Proposal
     from pipeline.profile_detection.recording_facts import Line
     from pipeline.records import Recording
     from pipeline.settings import Sensor
 
-SEARCHED_BYTES = 1 << 25  # of a log, for its layout
 MOST_IN_FULL = 3  # logs of one layout
 WIDTH = 118  # characters of a line
 EPILOG = """\
@@ -443,16 +442,12 @@ def _place(file: str | None, files: Sequence[Path]) -> str:
     return f"line {line}: " if line.isdigit() else f"{file}: "
 
 
-def _layouts(reading: Reading, code: str) -> list[Log]:
+def _layouts(reading: Reading, code: str) -> list[UnknownLog]:
     """Return the layout of each log that the profile does not describe; of a log of messages, that of one topic."""
     layouts = []
     for file in reading.files if code in UNKNOWN_LAYOUT else ():
         try:
-            if reading.has_topics:
-                layouts.append(topics_of(file)[0])
-                continue
-            with file.open("rb") as stream:
-                layouts.append(find_layout(stream.read(SEARCHED_BYTES), str(file)))
+            layouts.append(layouts_of(file)[0])
         except IngestError as none:
             print(f"{file}: {none.message}\n")
     return layouts
@@ -466,7 +461,8 @@ def _print_proposals(proposals: Sequence[Proposal], sensor_model: Sensor | None,
     for proposal in proposals:
         if proposal.complete:
             print("WITH THE PROFILE PROPOSED BELOW:\n")
-            ingest = Ingest.model_validate(proposal.ingest(name, sensor_model))
+            counts = {s: sensor_model.of(s).counts_per_unit for s in SENSORS} if sensor_model else {}
+            ingest = Ingest.model_validate(proposal.sections(name, counts))
             groups = [[Path(f) for f in proposal.files]] if proposal.parts else [[Path(f)] for f in proposal.files]
             for number, group in enumerate(groups):
                 outcome = _check_log(Reading.alone(group, ingest, sensor_model, "the proposed profile"))

@@ -7,6 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from imu_logs.yaml_file import read_yaml
 from pipeline.commands import parser_of
 from pipeline.config.options import LARGEST_CONFIG
 from pipeline.errors import ConfigurationError
@@ -15,7 +16,6 @@ from pipeline.exports.conversion import convert
 from pipeline.exports.reading import CALIBRATION, ImportedCalibration, counts_of, format_of, read_any
 from pipeline.exports.sensors import SensorFigures
 from pipeline.files import CONFIGS
-from pipeline.io.yaml_file import read_yaml
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:

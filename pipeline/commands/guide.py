@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from imu_logs.profile import checks_of
 from pipeline.commands import parser_of
 from pipeline.commands.readings import campaign_of, complete_rows, config_of_log, grouped, recordings_of_files
 from pipeline.config.campaign import load_campaign
 from pipeline.errors import CannotCalibrateError, ConfigurationError, PipelineError
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.io.files import recording_files
-from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.planning.guide import (
     MAX_PLANNED_RESTS,

@@ -10,12 +10,13 @@ from pathlib import Path
 from shutil import copyfile
 from typing import TYPE_CHECKING, Literal
 
+from imu_logs.files import MESSAGE_FORMATS, SUFFIXES
+from imu_logs.profile import checks_of
 from pipeline.config.compose import Composer
 from pipeline.config.options import Problem, nearest
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
-from pipeline.io.files import FILE, MESSAGE_FORMATS, SUFFIXES, candidate_files, parts_of
-from pipeline.io.ingest_settings import checks_of
+from pipeline.io.files import FILE, candidate_files, parts_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.settings import RecordingFile, Settings

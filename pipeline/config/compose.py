@@ -24,6 +24,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
 
+from imu_logs.profile import checks_of, csv_formats, mcap_formats
 from pipeline.config.options import (
     GROUPS,
     RUN_SETTINGS,
@@ -47,9 +48,9 @@ from pipeline.errors import ConfigurationError
 from pipeline.estimation.stages import NOT_WANTED, check_stages, declared
 from pipeline.files import CONFIGS
 from pipeline.history import SENSORS
-from pipeline.io.ingest_settings import check_ingest
+from pipeline.io.files import candidate_files
 from pipeline.model.sensor_file import completed, range_settings, without_overridden
-from pipeline.settings import OF_BENCH, SECTIONS, Method, Procedure, Section, Sensor, Settings, Stages, Unit
+from pipeline.settings import OF_BENCH, SECTIONS, Ingest, Method, Procedure, Section, Sensor, Settings, Stages, Unit
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -365,3 +366,13 @@ def _explain(error: Any, config: Mapping[str, Any]) -> str:  # noqa: ANN401  (py
         parent = parent.get(part, {}) if isinstance(parent, dict) else {}
     known = getattr(model, "model_fields", parent)
     return f"{setting}: unknown key{nearest(last, [k for k in known if k not in ('unit', last)])}"
+
+
+def check_ingest(ingest: Ingest, procedure: Procedure | None = None) -> None:
+    """Raise ``ConfigurationError`` for an invalid ingest profile, or if its parts do not match the procedure."""
+    mcap_formats(ingest)
+    checks_of(ingest)
+    if ingest.csv:
+        csv_formats(ingest)
+    if procedure is not None:
+        candidate_files(procedure, ingest)

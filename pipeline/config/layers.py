@@ -31,11 +31,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
+from imu_logs.files import not_regular, read_text
+from imu_logs.yaml_file import read_yaml
 from pipeline.config.options import GROUPS, RUN_SETTINGS, Problem, default_option, nearest, parse
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError, first
-from pipeline.io.files import not_regular, read_text, wrong_name
-from pipeline.io.yaml_file import read_yaml
+from pipeline.io.files import wrong_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 
+from imu_logs.yaml_file import read_yaml
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
-from pipeline.io.yaml_file import read_yaml
 from pipeline.settings import RunSettings
 
 if TYPE_CHECKING:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pipeline.config.campaign import Campaign, UnitRow
 
 PACKAGE = Path(__file__).resolve().parents[1]
+PACKAGES = ("pipeline", "imu_logs")  # beside each other, in a clone and in a wheel
 CAMPAIGN = "campaign"  # cannot be a batch, because their names end in a number
 EFFECTS = CONFIGS / "effect"  # read by pipeline.model.effects
 # An import of the package, or of jinja2: module and names, or only a module. ``ast`` takes 0.5 s for all files.
@@ -223,7 +224,7 @@ def _canonical(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)
 
 @cache
 def code_digest(*modules: str) -> str:
-    """Return a digest of the source of modules and of every module of the package that they import, at any depth.
+    """Return a digest of the source of modules and of every module of the packages that they import, at any depth.
 
     It includes all files of a package that imports its modules by name, the folder ``templates`` of a module that
     imports jinja2, and ``configs/effect/`` with the effects.
@@ -268,9 +269,9 @@ def _imports(file: Path) -> tuple[Path, ...]:
 
 @cache
 def _file_of(module: str) -> Path | None:
-    if module != "pipeline" and not module.startswith("pipeline."):
+    if module.partition(".")[0] not in PACKAGES:
         return None
-    path = PACKAGE.joinpath(*module.split(".")[1:])
+    path = PACKAGE.parent.joinpath(*module.split("."))
     for file in (path / "__init__.py", path.with_suffix(".py")):
         if file.is_file():
             return file

@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from imu_logs.files import read_text
+from imu_logs.yaml_file import MAX_YAML_BYTES
 from pipeline.config.options import Problem
 from pipeline.errors import ConfigurationError, PipelineError
 from pipeline.files import CONFIGS
 from pipeline.history import SENSORS
-from pipeline.io.files import read_text
-from pipeline.io.yaml_file import MAX_YAML_BYTES
 from pipeline.settings import OF_BENCH, UserEffectFiles
 
 if TYPE_CHECKING:

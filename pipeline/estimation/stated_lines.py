@@ -5,7 +5,7 @@ The rounding error of readings whose noise is below half a step is stated as not
     temperature   : u_T = sqrt(a^2 + R^2 / 12);  db = c_b u_T / sqrt(3),  dM = M c_k u_T / sqrt(3) by columns
     repeatability : db = r_b,  dM = M r_k by columns, each axis by itself
     bursts        : dM = M e of a gyroscope, e the relative uncertainty of the interval of samples that arrive in bursts
-                    (``pipeline.io.bursts``), where the time base is a source
+                    (``imu_logs.clocks``), where the time base is a source
     time base     : dM = M e of a gyroscope whose time is a count of rows at the sensor's stated rate (note
                     N-SYNTHTIME), or on a table whose rate is 1 + e times the change of its angle over the log's time
 

@@ -22,12 +22,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jinja2 import TemplateError
 
+from imu_logs.files import read_text
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, first
 from pipeline.exports import formats
 from pipeline.exports.sensors import FACTORS, FUNCTIONS
 from pipeline.exports.text_kinds import Expressions, Node, parsed
-from pipeline.io.channel_table import STRAIGHT, maps_of_log
-from pipeline.io.files import read_text
+from pipeline.io.axis_maps import STRAIGHT, maps_of_log
 from pipeline.model.calibration_file import read_calibration, sensor_of
 from pipeline.model.effects import effect
 from pipeline.pack import is_published, read_published

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from pipeline.io.channel_table import STRAIGHT, maps_of_log
+from pipeline.io.axis_maps import STRAIGHT, maps_of_log
 from pipeline.model.calibration_file import MIN_EXPORTED_TIME_S, sentences
 from pipeline.model.effects import owner_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner

@@ -26,11 +26,11 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
+from imu_logs.files import GIT_LFS, MESSAGE_FORMATS, not_regular
+from imu_logs.units import ACCELEROMETER, CANONICAL, GYROSCOPE, UNITS
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, PipelineError
 from pipeline.field_logs.log_checks import LogChecks
-from pipeline.io.channel_table import STRAIGHT, axis_matrix, in_body_axes, maps_of_log
-from pipeline.io.files import GIT_LFS, MESSAGE_FORMATS, not_regular
-from pipeline.io.units import ACCELEROMETER, CANONICAL, GYROSCOPE, UNITS
+from pipeline.io.axis_maps import STRAIGHT, axis_matrix, in_body_axes, maps_of_log
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.records import SENSORS, Recording
 from pipeline.settings import Ingest

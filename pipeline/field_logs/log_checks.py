@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.units import FORCE_UNITS
+from imu_logs.units import FORCE_UNITS
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:

@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mcap.records import Channel, Metadata, Schema
 
+from imu_logs.clocks import counted
+from imu_logs.mcap_file import McapReader
+from imu_logs.mcap_write import DEFINITIONS, IMU, TEMPERATURE, McapCopy, new_imu, replaced
+from imu_logs.message_decoder import MAPPED, Topics, listed_topics, topic_of
+from imu_logs.profile import mcap_format
+from imu_logs.units import ACCELEROMETER, GYROSCOPE, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.errors import IngestError, InputError
-from pipeline.io.ingest_settings import mcap_format
-from pipeline.io.mcap_copy import McapCopy
-from pipeline.io.mcap_reader import McapReader
-from pipeline.io.message_decoder import MAPPED, Topics, listed_topics, topic_of
-from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE, new_imu, replaced
-from pipeline.io.timestamps import counted
-from pipeline.io.units import ACCELEROMETER, GYROSCOPE, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.model.log_motion import ExponentialRegression
 
 if TYPE_CHECKING:
@@ -30,10 +29,10 @@ if TYPE_CHECKING:
 
     from mcap.records import McapRecord
 
+    from imu_logs.mcap_file import ChannelMessages
+    from imu_logs.message_decoder import TopicDecoder
+    from imu_logs.profile import McapFormat
     from pipeline.field_logs.compensate import LogProfile, LogStream, Output, Result
-    from pipeline.io.ingest_settings import McapFormat
-    from pipeline.io.mcap_chunk import ChannelMessages
-    from pipeline.io.message_decoder import TopicDecoder
     from pipeline.records import Integers, Values
 
 

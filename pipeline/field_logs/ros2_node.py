@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from imu_logs.mcap_write import VECTORS
 from pipeline.errors import PipelineError
-from pipeline.io.channel_table import axis_matrix, maps_of_log
-from pipeline.io.ros2_messages import VECTORS
+from pipeline.io.axis_maps import axis_matrix, maps_of_log
 from pipeline.model.calibration_file import read_calibration
 from pipeline.model.compensation import SMOOTHING_S, load
 from pipeline.model.log_motion import ExponentialRegression

@@ -17,32 +17,23 @@ import pyarrow as pa
 from pyarrow import compute as pc
 from pyarrow import csv
 
+from imu_logs.files import MESSAGE_FORMATS
+from imu_logs.log import in_house_unit
+from imu_logs.profile import checks_of, csv_formats, mcap_formats
+from imu_logs.text_layout import TextLayout, find_faults, other_separator
+from imu_logs.text_lines import TextLog
+from imu_logs.text_write import text_scalar, times_as_decimals, to_arrow, to_numpy
+from imu_logs.units import ACCELEROMETER, CANONICAL, COUNTS, GYROSCOPE, SECOND_NS, SINCE_1970_NS, TRIADS, UNITS
 from pipeline.errors import InputError
 from pipeline.field_logs.log_checks import DECIMALS
-from pipeline.io.arrow import text_scalar, times_as_decimals, to_arrow, to_numpy
-from pipeline.io.channel_table import in_house_unit
-from pipeline.io.csv_layout import TextLayout, find_faults, other_separator
-from pipeline.io.files import MESSAGE_FORMATS
-from pipeline.io.ingest_settings import checks_of, csv_formats, mcap_formats
-from pipeline.io.text_log import TextLog
-from pipeline.io.units import (
-    ACCELEROMETER,
-    CANONICAL,
-    COUNTS,
-    GYROSCOPE,
-    SECOND_NS,
-    SINCE_1970_NS,
-    TRIADS,
-    UNITS,
-)
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from imu_logs.text_lines import Head
     from pipeline.field_logs.compensate import LogProfile, LogStream, Output, Readings, Result
-    from pipeline.io.text_log import Head
     from pipeline.records import Integers, Values
     from pipeline.settings import Ingest
 
@@ -189,11 +180,11 @@ def compensate_whole(files: Sequence[Path], out: Output, profile: LogProfile, st
     """Write the calibrated readings of a message log, or of files joined on equal time, as text."""
     source, ingest = files[0], profile.ingest
     if source.suffix.lower() in MESSAGE_FORMATS:
-        from pipeline.io.mcap import read_logs  # noqa: PLC0415  (slow import, not for text logs)
+        from imu_logs.message_read import read_logs  # noqa: PLC0415  (slow import, not for text logs)
 
         table = read_logs(files, ingest)
     else:
-        from pipeline.io.csv_read import read_csv  # noqa: PLC0415  (only for joined files)
+        from imu_logs.text_read import read_csv  # noqa: PLC0415  (only for joined files)
 
         layouts = csv_formats(ingest)
         table = read_csv(files, [layouts[part] for part in sensor_parts(ingest)], checks_of(ingest))

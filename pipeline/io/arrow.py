@@ -1,41 +1,30 @@
-"""Write and read recordings as Parquet, and write canonical CSV, by pyarrow.
+"""Write and read recordings as Parquet, by pyarrow.
 
-**Parquet**: one file for each unit, with its recordings one after the other. ``time_ns`` is int64, ``flags`` uint16,
-every channel a double, null in the rows of recordings without it. The file is a member of a pack, which has a checksum
+One file for each unit, with its recordings one after the other. ``time_ns`` is int64, ``flags`` uint16, every channel a
+double, null in the rows of recordings without it. The file is a member of a pack, which has a checksum
 (``pipeline.pack``). The same recordings give the same bytes.
-
-**CSV**: a number with d decimals is written as a decimal,
-
-    round(value * 10^d)  ->  decimal128(38, d)  ->  text
-
-so that the file contains the nearest decimal, and reading it gives ``round(value * 10^d) / 10^d`` to the last bit.
-
-``pyarrow.array`` is not used, because it imports pandas, which takes 0.25 s.
 """
 
 from __future__ import annotations
 
 import json
-import os
 from functools import cached_property, partial
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-from pyarrow import csv, parquet
+from pyarrow import parquet
 
-from pipeline.errors import ConfigurationError, InputError
-from pipeline.io.units import ACCELEROMETER, ATTITUDE, CANONICAL, CHANNELS, GYROSCOPE
+from imu_logs.text_write import to_arrow, to_numpy
+from imu_logs.units import ACCELEROMETER, ATTITUDE, CHANNELS, GYROSCOPE
+from pipeline.errors import InputError
 from pipeline.records import Note, Recording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Integers
 
 BLOCKS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE, "table_attitude": ATTITUDE}
 SINGLES = ("temperature", "table_angle", "table_rate", "flags")
@@ -47,23 +36,6 @@ TYPES = {"time_ns": "int64", **dict.fromkeys(CHANNELS, "float64"), "flags": "uin
 PAGE_ENCODINGS = {"int64": "DELTA_BINARY_PACKED", "float64": "PLAIN", "uint16": "PLAIN"}
 
 
-def to_numpy(column: Any) -> NDArray[Any]:  # noqa: ANN401  (pyarrow has no types)
-    """Return the numbers of a column without nulls."""
-    return np.asarray(np.from_dlpack(column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column))
-
-
-def to_arrow(values: NDArray[Any]) -> pa.Array:
-    """Return numbers as a column."""
-    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values)])
-
-
-def text_scalar(text: str) -> pa.Scalar:
-    """Return a text as a scalar for functions of ``pyarrow.compute``."""
-    data = text.encode()
-    offsets = np.array([0, len(data)], np.int32)
-    return pa.Array.from_buffers(pa.string(), 1, [None, pa.py_buffer(offsets), pa.py_buffer(data)])[0]
-
-
 def columns_of(recording: Recording) -> dict[str, NDArray[Any]]:
     """Return the times, channels and flags of a recording, by name."""
     columns: dict[str, NDArray[Any]] = {"time_ns": recording.time_ns}
@@ -72,45 +44,6 @@ def columns_of(recording: Recording) -> dict[str, NDArray[Any]]:
         if block is not None:
             columns |= {c: np.ascontiguousarray(block[:, i]) for i, c in enumerate(channels)}
     return columns | {n: getattr(recording, n) for n in SINGLES if getattr(recording, n) is not None}
-
-
-def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str, int] = MappingProxyType({})) -> None:
-    """Write a recording as canonical CSV; the file is replaced atomically.
-
-    Readings are written along the body axes. ``decimals``: header name (``accel_x_g`` ...) to digits after the point;
-    other columns are written without loss.
-    """
-    unknown = [name for name in decimals if name not in CANONICAL.values()]
-    if unknown:
-        known = ", ".join(list(CANONICAL.values())[1:])
-        raise ConfigurationError(f"decimals of unknown columns {', '.join(unknown)}; known are {known}")
-    columns = columns_of(recording)
-    time = columns.pop("time_ns")
-    digits = next((d for d in (3, 6) if not np.any(time % 10 ** (9 - d))), 9)  # the fewest that hold the times exactly
-    arrays = {CANONICAL["time"]: times_as_decimals(time, digits)}
-    for channel, name in CANONICAL.items():
-        if channel in columns and name in decimals:
-            values = np.rint(columns[channel] * 10.0 ** decimals[name]).astype(np.int64)
-            arrays[name] = _decimal(values, decimals[name])
-        elif channel in columns:
-            arrays[name] = to_arrow(np.ascontiguousarray(columns[channel]))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as stream:
-        stream.write((",".join(arrays) + "\n").encode())
-        csv.write_csv(pa.table(arrays), stream, csv.WriteOptions(include_header=False))
-    temporary.replace(path)
-
-
-def times_as_decimals(time_ns: Integers, digits: int = 9) -> pa.Array:
-    """Return times in s as decimals with ``digits`` after the point, which must represent them exactly."""
-    return _decimal(time_ns, 9).cast(pa.decimal128(38, digits))
-
-
-def _decimal(units: Integers, digits: int) -> pa.Array:
-    """Return integers as decimals ``units / 10^digits``; the high word of the 128 bits is the sign."""
-    words = np.empty((len(units), 2), np.int64)
-    words[:, 0], words[:, 1] = units, units >> 63
-    return pa.Array.from_buffers(pa.decimal128(38, digits), len(units), [None, pa.py_buffer(words)])
 
 
 def to_parquet(recordings: Sequence[Recording]) -> bytes:

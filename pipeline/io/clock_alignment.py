@@ -23,20 +23,22 @@ interpolation, 0.5 % of the table's interval.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imu_logs.log import Note
+from imu_logs.units import TABLE_TIME, TRIADS
 from pipeline.errors import IngestError
-from pipeline.io.encoder_log import Signals, seconds_of, signals_of
-from pipeline.io.units import TRIADS
+from pipeline.io.encoder_log import Signals, interpolators, seconds_of, signals_of, unwrapped
 
 if TYPE_CHECKING:
-    from pipeline.io.channel_table import ChannelTable
+    from imu_logs.log import Log
     from pipeline.records import Mask, Values
 
 
+MIN_SPLINE_ROWS = 6  # for the quintic spline
 SMALLEST_CORRELATION = 0.9  # at most 19 % of the variance of the rates is not explained, 1 - 0.9^2
 BLOCKS_S = (1.0, 4.0)  # about the length of a ramp of the rate, and longer
 COARSE_S = 0.01  # step of the grid of offsets
@@ -82,7 +84,7 @@ class SensorSignals:
         return SensorSignals(self.time[rows], self.readings[rows], self.rates, self.noise)
 
 
-def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
+def fit_clocks(sensor: Log, log: Log) -> ClockFit:
     """Return offset and drift of the table's clock; the times count from the first sample of each log.
 
     Raises ``IngestError`` for a sensor without gyroscope, and for logs that do not show the same motion, or that fit
@@ -117,7 +119,7 @@ def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
     return fit
 
 
-def _sensor_signals(sensor: ChannelTable, signals: Signals) -> SensorSignals:
+def _sensor_signals(sensor: Log, signals: Signals) -> SensorSignals:
     rates = np.column_stack([sensor.values[c] for c in TRIADS["gyroscope"]])
     if signals.magnitude:
         rates = np.linalg.norm(rates - np.median(rates, axis=0), axis=1)[:, None]
@@ -238,3 +240,66 @@ def _uncertainties_by_blocks(J: Values, e: Values, sensed: SensorSignals, covari
     spread = np.linalg.norm(covariance @ scores.T, axis=1)
     blocks = information.sum(axis=0) ** 2 / np.sum(information**2, axis=0)
     return np.asarray(spread * np.sqrt(blocks / np.maximum(blocks - 2.0, 1.0 / MIN_CLOCK_BLOCKS)))
+
+
+def align(sensor: Log, log: Log) -> Log:
+    """Add the channels of a table's log, interpolated at the sensor's times; refuse logs of different motions.
+
+    Rows that the table's log does not cover are dropped. If the table rests throughout, no result depends on the
+    alignment, and both logs are assumed to begin together.
+    """
+    log = unwrapped(log)
+    t, log_time = seconds_of(sensor), seconds_of(log)
+    if len(log_time) < MIN_SPLINE_ROWS:
+        message = f"the table's log has {len(log_time)} rows; at least {MIN_SPLINE_ROWS} are needed"
+        raise IngestError(message, log.path, code="no_sync")
+    if signals_of(log).resting:
+        tau = np.clip(t, 0.0, log_time[-1])
+        note = Note("N-SYNC", len(t), 0, 0, "the table rests throughout its log: there is no motion to align by")
+        return _merged(sensor, log, slice(0, len(t)), tau, {}, [note])
+    fit = fit_clocks(sensor, log)
+    tau = fit.table_time(t)
+    inside = np.flatnonzero((tau >= 0) & (tau <= log_time[-1]))
+    if inside.size < 2:
+        raise IngestError("no time is covered by both logs", log.path, code="no_sync")
+    rows = slice(int(inside[0]), int(inside[-1]) + 1)
+    clock = {
+        "offset_s": float(log.time_ns[0] - sensor.time_ns[0]) / 1e9 + fit.offset,
+        "offset_uncertainty_s": fit.offset_uncertainty,
+        "drift_ppm": fit.drift * 1e6,
+        "drift_uncertainty_ppm": fit.drift_uncertainty * 1e6,
+        "at_s": fit.middle,
+        "correlation": fit.correlation,
+    }
+    return _merged(sensor, log, rows, tau[rows], clock, _notes(sensor, rows, fit, clock["offset_s"]))
+
+
+def _notes(sensor: Log, rows: slice, fit: ClockFit, offset_s: float) -> list[Note]:
+    detail = (
+        f"the table's clock is {offset_s:.7g} s (+- {_one_digit(fit.offset_uncertainty)} s, one standard deviation) "
+        f"ahead of the sensor's {fit.middle:.4g} s after its first sample and gains {fit.drift * 1e6:.3g} ppm "
+        f"(+- {_one_digit(fit.drift_uncertainty * 1e6)}); aligned by the motion in both logs (correlation "
+        f"{fit.correlation:.5f})"
+    )
+    sync = sensor.note("N-SYNC", np.arange(rows.start, rows.stop), detail)
+    lost = len(sensor.time_ns) - sync.count
+    detail = f"{lost} rows that the table's log does not cover were left out"
+    return [sync, *([Note("N-CUT", lost, sync.first, sync.last, detail)] if lost else [])]
+
+
+def _one_digit(value: float) -> str:
+    """Format a number with one significant digit, without exponent."""
+    return np.format_float_positional(float(f"{value:.1g}"), trim="-")
+
+
+def _merged(sensor: Log, log: Log, rows: slice, tau: Values, clock: dict[str, float], notes: list[Note]) -> Log:  # noqa: PLR0917
+    hashes = {entry.get("sha256") for entry in (sensor.source, *sensor.source.get("joined", []))} - {None}
+    same, found = log.source is sensor.source or log.source.get("sha256") in hashes, interpolators(log)
+    part = sensor.select(rows, *(() if same else log.notes), *notes)
+    joined = {} if same else {"joined": [*sensor.source.get("joined", []), log.source]}
+    sensor_channels = {c: v for c, v in part.values.items() if c not in log.values and c != TABLE_TIME}
+    return replace(
+        part,
+        values=sensor_channels | {channel: at(tau) for channel, at in found.items()},
+        source=sensor.source | ({"table_clock": clock} if clock else {}) | joined,
+    )

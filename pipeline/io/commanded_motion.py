@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.channel_table import ChannelTable
+from imu_logs.log import Log
+from imu_logs.units import TRIADS
 from pipeline.io.clock_alignment import fit_clocks
 from pipeline.io.encoder_log import seconds_of
-from pipeline.io.units import TRIADS
 from pipeline.records import Note
 from pipeline.settings import ProgramRest, ProgramTurn, Repeated
 
@@ -36,14 +36,14 @@ MAX_FIT_ITERATIONS = 12  # iterations at most; they end where no move changes by
 MAX_SHARE_OF_REST = 0.5  # of the rest before or after a move
 
 
-def follow_program(table: ChannelTable, program: Sequence[ProgramRest | ProgramTurn | Repeated]) -> ChannelTable:
+def follow_program(table: Log, program: Sequence[ProgramRest | ProgramTurn | Repeated]) -> Log:
     """Add the angle and rate of a table with this program to a log; the gyroscope must show the moves."""
     pause = ProgramRest(rest_s=BEFORE_S)
     commanded = Program([pause, *_flat(program), pause])
     times = np.arange(0.0, commanded.duration, PROGRAM_STEP_S)
     angle, rate, *_ = commanded.at(times)
     log = {"table_angle": angle, "table_rate": rate}
-    fit = fit_clocks(table, ChannelTable(table.path, np.rint(times * 1e9).astype(np.int64), log, table.source))
+    fit = fit_clocks(table, Log(table.path, np.rint(times * 1e9).astype(np.int64), log, table.source))
     t = seconds_of(table)
     tau, shifts, drift, begun = _place(table, commanded, t, fit.table_time(t))
     angle, rate, *_ = commanded.at(tau)
@@ -114,7 +114,7 @@ def _flat(program: Sequence[ProgramRest | ProgramTurn | Repeated]) -> Iterator[P
             yield step
 
 
-def _place(table: ChannelTable, program: Program, t: Values, tau: Values) -> tuple[Values, Values, float, float]:
+def _place(table: Log, program: Program, t: Values, tau: Values) -> tuple[Values, Values, float, float]:
     """Fit the time of each move to the readings of the gyroscope near it.
 
     Returns the program's time at the sensor's times, s; the deviation of each move, s; the drift; and the sensor's time
@@ -147,7 +147,7 @@ def _place(table: ChannelTable, program: Program, t: Values, tau: Values) -> tup
     return np.clip(middle[near] + (1.0 + drift) * since + shifts[near], low, high), shifts, drift, begun
 
 
-def _about_the_moves(table: ChannelTable, commanded: Values) -> Values:
+def _about_the_moves(table: Log, commanded: Values) -> Values:
     """Return the rate about the axis of the moves by the gyroscope, corrected for scale and bias: (n,) array, deg/s."""
     rates = np.column_stack([table.values[c] for c in TRIADS["gyroscope"]])
     columns = np.column_stack([commanded, np.ones_like(commanded)])

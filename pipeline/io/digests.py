@@ -8,7 +8,8 @@ from __future__ import annotations
 import hashlib
 from typing import TYPE_CHECKING, Any
 
-from pipeline.io.files import not_regular, recording_files
+from imu_logs.files import not_regular
+from pipeline.io.files import recording_files
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -31,8 +31,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imu_logs.units import STANDARD_GRAVITY
 from pipeline.io.quality_flags import GAP
-from pipeline.io.units import STANDARD_GRAVITY
 from pipeline.records import (
     MEDIAN_SIZE,
     SENSOR_UNITS,
@@ -73,7 +73,7 @@ LARGEST_SHARE = 0.1  # of the pieces
 def leave_out_disturbances(
     recording: Recording, note: Callable[[str, Index, str], Note], largest_share: float
 ) -> Recording:
-    """Remove the disturbed samples of a recording, and note them by ``note``, the method of its ``ChannelTable``.
+    """Remove the disturbed samples of a recording, and note them by ``note``, the method of its ``Log``.
 
     If they are more than ``largest_share`` of the samples, none is removed, and that is noted: then the disturbance is
     a property of the bench.

@@ -15,19 +15,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imu_logs.log import Log
+from imu_logs.units import ATTITUDE, TABLE_CHANNELS, TABLE_TIME
 from pipeline.errors import IngestError
-from pipeline.io.channel_table import ChannelTable
-from pipeline.io.units import ATTITUDE, TABLE_CHANNELS, TABLE_TIME
-from pipeline.records import Note, conjugate_product, continuous, level_in_body
+from pipeline.records import conjugate_product, continuous, level_in_body
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pipeline.io.clock_alignment import ClockFit
     from pipeline.records import Mask, Values
 
 
-MIN_SPLINE_ROWS = 6  # for the quintic spline
 ENCODER_STEP_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
 MOST_POINTS = 1 << 18  # bounds memory and the cost of correlation; a power of 2 for the transform
 BENT_SLOPE_RATIO = 8.0  # times the median change of slope
@@ -70,15 +68,15 @@ class Signals:
         return r + (r_next - r) * x, u + (u_next - u) * x, (r_next - r) * slope, (u_next - u) * slope
 
 
-def own_rows(table: ChannelTable) -> ChannelTable:
+def own_rows(table: Log) -> Log:
     """Return the table's channels of a log whose rows have a separate time of the table."""
     time = np.rint(table.values[TABLE_TIME]).astype(np.int64)
     new = np.concatenate([[True], time[1:] > np.maximum.accumulate(time)[:-1]])
     values = {c: table.values[c] for c in TABLE_CHANNELS if c in table.values}
-    return ChannelTable(table.path, time, values, table.source, table.lines).select(new)
+    return Log(table.path, time, values, table.source, table.lines).select(new)
 
 
-def unwrapped(table: ChannelTable) -> ChannelTable:
+def unwrapped(table: Log) -> Log:
     """Make the table's angle continuous where the encoder restarts at 0 or 360 deg.
 
     A table turns by less than half a turn between two samples, so that a larger step is a restart of the encoder.
@@ -94,73 +92,7 @@ def unwrapped(table: ChannelTable) -> ChannelTable:
     return replace(table, values=values, notes=(*table.notes, note))
 
 
-def align(sensor: ChannelTable, log: ChannelTable) -> ChannelTable:
-    """Add the channels of a table's log, interpolated at the sensor's times; refuse logs of different motions.
-
-    Rows that the table's log does not cover are dropped. If the table rests throughout, no result depends on the
-    alignment, and both logs are assumed to begin together.
-    """
-    from pipeline.io.clock_alignment import fit_clocks  # noqa: PLC0415  (it reads the signals of this module)
-
-    log = unwrapped(log)
-    t, log_time = seconds_of(sensor), seconds_of(log)
-    if len(log_time) < MIN_SPLINE_ROWS:
-        message = f"the table's log has {len(log_time)} rows; at least {MIN_SPLINE_ROWS} are needed"
-        raise IngestError(message, log.path, code="no_sync")
-    if signals_of(log).resting:
-        tau = np.clip(t, 0.0, log_time[-1])
-        note = Note("N-SYNC", len(t), 0, 0, "the table rests throughout its log: there is no motion to align by")
-        return _merged(sensor, log, slice(0, len(t)), tau, {}, [note])
-    fit = fit_clocks(sensor, log)
-    tau = fit.table_time(t)
-    inside = np.flatnonzero((tau >= 0) & (tau <= log_time[-1]))
-    if inside.size < 2:
-        raise IngestError("no time is covered by both logs", log.path, code="no_sync")
-    rows = slice(int(inside[0]), int(inside[-1]) + 1)
-    clock = {
-        "offset_s": float(log.time_ns[0] - sensor.time_ns[0]) / 1e9 + fit.offset,
-        "offset_uncertainty_s": fit.offset_uncertainty,
-        "drift_ppm": fit.drift * 1e6,
-        "drift_uncertainty_ppm": fit.drift_uncertainty * 1e6,
-        "at_s": fit.middle,
-        "correlation": fit.correlation,
-    }
-    return _merged(sensor, log, rows, tau[rows], clock, _notes(sensor, rows, fit, clock["offset_s"]))
-
-
-def _notes(sensor: ChannelTable, rows: slice, fit: ClockFit, offset_s: float) -> list[Note]:
-    detail = (
-        f"the table's clock is {offset_s:.7g} s (+- {_one_digit(fit.offset_uncertainty)} s, one standard deviation) "
-        f"ahead of the sensor's {fit.middle:.4g} s after its first sample and gains {fit.drift * 1e6:.3g} ppm "
-        f"(+- {_one_digit(fit.drift_uncertainty * 1e6)}); aligned by the motion in both logs (correlation "
-        f"{fit.correlation:.5f})"
-    )
-    sync = sensor.note("N-SYNC", np.arange(rows.start, rows.stop), detail)
-    lost = len(sensor.time_ns) - sync.count
-    detail = f"{lost} rows that the table's log does not cover were left out"
-    return [sync, *([Note("N-CUT", lost, sync.first, sync.last, detail)] if lost else [])]
-
-
-def _one_digit(value: float) -> str:
-    """Format a number with one significant digit, without exponent."""
-    return np.format_float_positional(float(f"{value:.1g}"), trim="-")
-
-
-def _merged(  # noqa: PLR0917  (parts of one table)
-    sensor: ChannelTable, log: ChannelTable, rows: slice, tau: Values, clock: dict[str, float], notes: list[Note]
-) -> ChannelTable:
-    same, found = log.source is sensor.source, interpolators(log)
-    part = sensor.select(rows, *(() if same else log.notes), *notes)
-    joined = {} if same else {"joined": [*sensor.source.get("joined", []), log.source]}
-    sensor_channels = {c: v for c, v in part.values.items() if c not in log.values and c != TABLE_TIME}
-    return replace(
-        part,
-        values=sensor_channels | {channel: at(tau) for channel, at in found.items()},
-        source=sensor.source | ({"table_clock": clock} if clock else {}) | joined,
-    )
-
-
-def signals_of(log: ChannelTable) -> Signals:
+def signals_of(log: Log) -> Signals:
     """Return the signals of a table's motion; raise ``IngestError`` for a log without rate, angle and attitude."""
     log_time = seconds_of(log)
     found = interpolators(log)
@@ -182,12 +114,12 @@ def signals_of(log: ChannelTable) -> Signals:
     raise IngestError("the table's log holds neither rate, angle nor attitude", log.path, code="no_sync")
 
 
-def seconds_of(table: ChannelTable) -> Values:
+def seconds_of(table: Log) -> Values:
     """Return the times of a log since its first sample, s."""
     return np.asarray((table.time_ns - table.time_ns[0]) / 1e9)
 
 
-def interpolators(log: ChannelTable) -> dict[str, Callable[[Values], Values]]:
+def interpolators(log: Log) -> dict[str, Callable[[Values], Values]]:
     """Return an interpolating function of the table's time, s, for each channel."""
     log_time, values = seconds_of(log), log.values
     out: dict[str, Callable[[Values], Values]] = {}

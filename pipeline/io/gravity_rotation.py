@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.units import DEGREES, TRIADS
+from imu_logs.units import DEGREES, TRIADS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.io.channel_table import ChannelTable
+    from imu_logs.log import Log
     from pipeline.records import Values
 
 ROTATION_BLOCK_S = 0.25  # two blocks make the shortest rest, half a second
@@ -132,7 +132,7 @@ def misfits_deg(moves: Sequence[MoveByHand], scales: Sequence[float]) -> Values:
     return np.asarray(np.degrees(np.arccos(np.clip(np.sum(direction * after, axis=2), -1.0, 1.0))))
 
 
-def declared_scale(table: ChannelTable) -> tuple[float, str] | None:
+def declared_scale(table: Log) -> tuple[float, str] | None:
     """Return the factor by which the angular rates are wrong, and the evidence; None if they are right or undecided."""
     if not {"accel_x", "gyro_x"} <= table.values.keys():
         return None

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imu_logs.clocks import bursts_error, rounded_error
+from imu_logs.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TABLE_CHANNELS, TRIADS
 from pipeline.errors import IngestError
-from pipeline.io.bursts import bursts_error, rounded_error
-from pipeline.io.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TABLE_CHANNELS, TRIADS
 from pipeline.records import SENSOR_UNITS
 
 if TYPE_CHECKING:
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.channel_table import ChannelTable
-    from pipeline.io.ingest_settings import Checks
+    from imu_logs.log import Log
+    from imu_logs.profile import Checks
     from pipeline.records import Index, Integers, Mask, Note
     from pipeline.settings import Sensor
 
-GAP, CLIPPED, STUCK, REPAIRED = np.uint16(1), np.uint16(2), np.uint16(4), np.uint16(8)  # bits of ``Recording.flags``
+GAP, CLIPPED, STUCK = np.uint16(1), np.uint16(2), np.uint16(4)  # bits of ``Recording.flags``
 GAP_INTERVALS = 1.5  # half way to one missing sample
 JITTER_NOTED, JITTER_TOO_LARGE = 0.2, 0.5  # rms, relative to the median interval; spectra need regular samples
 FULL_SCALE_MARGIN = 1.2  # sensors read up to a fifth beyond their nominal range
@@ -59,7 +59,7 @@ _OTHER_FACTORS = {
 }  # fmt: skip
 
 
-def flag_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) -> list[Note]:
+def flag_gaps(table: Log, flags: NDArray[np.uint16], checks: Checks) -> list[Note]:
     """Flag gaps, and note irregular intervals; raise ``IngestError`` beyond ``checks.missing_time`` of missing time."""
     steps = np.diff(table.time_ns)
     usual = float(np.median(steps))
@@ -82,7 +82,7 @@ def flag_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) ->
     return [table.note("N-GAP", rows, detail), *_irregular(table, steps[steps <= limit], usual)]
 
 
-def _irregular(table: ChannelTable, steps: Integers, usual: float) -> list[Note]:
+def _irregular(table: Log, steps: Integers, usual: float) -> list[Note]:
     if not steps.size or int(steps.max()) - int(steps.min()) <= JITTER_NOTED * usual:
         return []
     jitter = float(np.sqrt(np.mean((steps / usual - 1.0) ** 2)))
@@ -94,7 +94,7 @@ def _irregular(table: ChannelTable, steps: Integers, usual: float) -> list[Note]
     return [table.note("N-JITTER", np.array([0, len(table.time_ns) - 1]), detail)]
 
 
-def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDArray[np.uint16]) -> list[Note]:
+def flag_clipped(table: Log, sensor: str, full_scale: float, flags: NDArray[np.uint16]) -> list[Note]:
     """Flag readings at full scale, g or deg/s; refuse those far beyond it."""
     notes = []
     for channel in TRIADS[sensor]:
@@ -130,7 +130,7 @@ def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
     return notes
 
 
-def flag_flat_tops(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> list[Note]:
+def flag_flat_tops(table: Log, sensor: str, flags: NDArray[np.uint16]) -> list[Note]:
     """Flag readings that repeat the largest or the smallest value of their channel more often than noise allows.
 
     The range of such a sensor or logger is smaller than is stated. k repetitions are expected ``n p^k`` times by
@@ -164,7 +164,7 @@ def flag_flat_tops(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) 
     return notes
 
 
-def find_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> dict[str, Index]:
+def find_stuck(table: Log, sensor: str, flags: NDArray[np.uint16]) -> dict[str, Index]:
     """Return the rows, by channel, of readings that are constant for longer than the noise of the channel allows.
 
     Raises ``IngestError`` for an axis that is constant in half of the rows or more, while the other axes of its sensor
@@ -206,7 +206,7 @@ def _common_rows(found: Mapping[str, Index]) -> dict[str, Index]:
     return {c: np.concatenate([cut(int(run[0]), int(run[-1])) for run in of]) for c, of in runs.items()}
 
 
-def flag_stuck(table: ChannelTable, found: Mapping[str, Index], flags: NDArray[np.uint16]) -> list[Note]:
+def flag_stuck(table: Log, found: Mapping[str, Index], flags: NDArray[np.uint16]) -> list[Note]:
     """Flag stuck rows; return a note for each stretch of rows, or one note if there are many stretches."""
     if not found:
         return []
@@ -274,7 +274,7 @@ def _in_a_row(same: Mask, count: int) -> bool:
     return bool(np.any(places[further:] - places[: max(len(places) - further, 0)] == further))
 
 
-def examine(table: ChannelTable, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[np.uint16] | None, list[Note]]:
+def examine(table: Log, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[np.uint16] | None, list[Note]]:
     """Return quality flags (None if none is set) and notes; raise ``IngestError`` for impossible values.
 
     ``sensor``: with the full scales; None if they are not known.
@@ -302,7 +302,7 @@ def examine(table: ChannelTable, sensor: Sensor | None, checks: Checks) -> tuple
     return (flags if flags.any() else None), notes
 
 
-def _check_rate(table: ChannelTable, checks: Checks) -> None:
+def _check_rate(table: Log, checks: Checks) -> None:
     if checks.rate_hz is None:
         return
     interval_us = float(np.median(np.diff(table.time_ns))) / 1e3
@@ -321,7 +321,7 @@ def _check_rate(table: ChannelTable, checks: Checks) -> None:
     raise IngestError(message, table.path, code="wrong_rate", hint=hint)
 
 
-def _check_force(table: ChannelTable) -> None:
+def _check_force(table: Log) -> None:
     if "accel_x" not in table.values:
         return
     stride = -(-len(table.time_ns) // MEDIAN_SAMPLES)
@@ -343,7 +343,7 @@ def _check_force(table: ChannelTable) -> None:
     raise IngestError(message, table.path, code="implausible_force")
 
 
-def _check_attitude(table: ChannelTable) -> None:
+def _check_attitude(table: Log) -> None:
     if ATTITUDE[0] not in table.values:
         return
     norm = np.sqrt(sum(table.values[c] ** 2 for c in ATTITUDE))
@@ -357,7 +357,7 @@ def _check_attitude(table: ChannelTable) -> None:
         raise IngestError(message, table.place(row), code="bad_attitude")
 
 
-def _check_turn_rate(table: ChannelTable) -> None:
+def _check_turn_rate(table: Log) -> None:
     """Raise ``IngestError`` if rates differ by a factor of 180/pi from the table's, or from gravity's rotation."""
     if "gyro_x" not in table.values:
         return

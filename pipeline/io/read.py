@@ -8,7 +8,6 @@ coarse to differentiate.
 
 from __future__ import annotations
 
-import io
 import itertools
 import os
 from dataclasses import replace
@@ -17,27 +16,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+import imu_logs
+from imu_logs.profile import checks_of, csv_formats
+from imu_logs.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.errors import IngestError, MissingInputError
-from pipeline.files import CONFIGS
-from pipeline.io.channel_table import STRAIGHT, axis_maps, axis_matrix, in_body_axes, map_of_orientation
+from pipeline.io.axis_maps import STRAIGHT, axis_maps, axis_matrix, in_body_axes, map_of_orientation
 from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.io.encoder_log import unwrapped
-from pipeline.io.files import MESSAGE_FORMATS, candidate_files
-from pipeline.io.ingest_settings import checks_of, csv_formats
+from pipeline.io.files import candidate_files
 from pipeline.io.quality_flags import examine
-from pipeline.io.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TRIADS
 from pipeline.records import Note, Recording, files_of_readings, rate_of_attitude
-from pipeline.settings import Ingest
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
+    from imu_logs.log import Log
+    from imu_logs.profile import Checks, CsvFormat
     from pipeline.errors import InputError
-    from pipeline.io.channel_table import ChannelTable
-    from pipeline.io.ingest_settings import Checks, CsvFormat
     from pipeline.records import Values
-    from pipeline.settings import Procedure, RecordingFile, Sensor
+    from pipeline.settings import Ingest, Procedure, RecordingFile, Sensor
 
 
 MAX_NAMED_FILES = 5  # further files that an error lists
@@ -73,7 +71,7 @@ def read_recordings(
             continue
         try:
             if name in in_memory:
-                table = read_canonical(name, in_memory[name], checks)
+                table = imu_logs.read_canonical(f"{name} {IN_MEMORY}", in_memory[name], ingest)
             else:
                 table = read_table([folder / f for f in files], ingest, layouts, entry.session)
             recording = to_recording(name, entry, table, sensor, checks)
@@ -104,45 +102,20 @@ def read_table(
     ingest: Ingest,
     layouts: Sequence[CsvFormat] | None = None,
     session: int | None = None,
-) -> ChannelTable:
+) -> Log:
     """Read the file or files of one recording, by their suffix; ``layouts`` are ``csv_formats(ingest)``.
 
     ``session``: which part, from 1, of a text log that was restarted.
     """
-    if paths[0].suffix.lower() in (".mcap", *MESSAGE_FORMATS):
-        from pipeline.io.mcap import read_logs  # noqa: PLC0415  (the decoder costs what a text log need not pay)
+    table = imu_logs.read(paths, ingest, session=session, layouts=layouts)
+    if not table.apart and TABLE_TIME not in table.values:
+        return table
+    from pipeline.io.clock_alignment import align  # noqa: PLC0415  (only where it is needed)
+    from pipeline.io.encoder_log import own_rows  # noqa: PLC0415  (only where it is needed)
 
-        return read_logs(paths, ingest)
-    from pipeline.io.csv_read import read_csv, read_gcsv  # noqa: PLC0415  (a log of messages needs no parser of text)
-
-    if paths[0].suffix == ".gcsv":
-        return read_gcsv(paths[0], checks_of(ingest))
-    layouts = layouts or csv_formats(ingest)
-    if session is None:
-        return read_csv(paths, layouts, checks_of(ingest))
-    table = read_csv(paths, [f.model_copy(update={"session": session}) for f in layouts], checks_of(ingest))
-    return replace(table, source={**table.source, "session": session})
-
-
-def read_canonical(name: str, text: bytes, checks: Checks) -> ChannelTable:
-    """Read a canonical CSV that is in memory (``pipeline.io.data_frame``)."""
-    from pipeline.io.csv_read import read_stream  # noqa: PLC0415  (a log of messages needs no parser of text)
-
-    (layout,) = csv_formats(canonical())
-    try:
-        return read_stream(io.BytesIO(text), f"{name} {IN_MEMORY}", layout, checks)
-    except IngestError as error:
-        if error.code != "missing_column":
-            raise
-        hint = "name the columns of the DataFrame as in the canonical CSV"
-        raise IngestError(error.fact, error.file, code=error.code, hint=hint) from None
-
-
-def canonical() -> Ingest:
-    """Return the ingest profile of the canonical CSV."""
-    from pipeline.io.yaml_file import read_yaml  # noqa: PLC0415  (a run reads profiles as settings)
-
-    return Ingest.model_validate(read_yaml(CONFIGS / "ingest" / "canonical_csv.yaml"))
+    for log in table.apart or (own_rows(table),):
+        table = align(table, log)
+    return replace(table, apart=())
 
 
 def _existing(candidates: Sequence[Sequence[str]], folder: Path) -> tuple[list[str], list[str], list[str]]:
@@ -173,9 +146,7 @@ def of_one_sensor(procedure: Procedure, files: Collection[str]) -> str:
     return f"; of a unit without {lacking[0]}, set method.{lacking[0]}=null" if len(lacking) == 1 and others else ""
 
 
-def to_recording(
-    name: str, entry: RecordingFile, table: ChannelTable, sensor: Sensor | None, checks: Checks
-) -> Recording:
+def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | None, checks: Checks) -> Recording:
     """Convert a table of channels to a recording in body axes, with quality flags; removes the channels from ``table``.
 
     ``entry``: of the procedure, with the ``program`` of a table without a log. ``sensor``: None if it is not known.

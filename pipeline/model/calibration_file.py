@@ -33,8 +33,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from imu_logs.files import not_regular
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, first
-from pipeline.io.files import not_regular
 from pipeline.model.checked import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import parameter_limits

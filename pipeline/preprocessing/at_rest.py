@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.units import TRIADS
+from imu_logs.units import TRIADS
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.preprocessing.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, refusal
 from pipeline.records import SENSOR_UNITS, SENSORS, Note, median

@@ -53,7 +53,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.channel_table import axis_matrix
+from pipeline.io.axis_maps import axis_matrix
 from pipeline.io.gravity_rotation import FAILS_DEG, MAX_ROTATION_SAMPLES, MIN_MEDIAN_MOVES, misfits_deg, moves_of
 from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.records import AXES

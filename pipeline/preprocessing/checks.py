@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imu_logs.units import TRIADS
 from pipeline.io.quality_flags import EXPECTED_CHANCE_RUNS
-from pipeline.io.units import TRIADS
 from pipeline.model.kinematics import normal_gravity_g
 from pipeline.preprocessing.at_rest import check_axes, check_static
 from pipeline.preprocessing.coarse_temperature import refined

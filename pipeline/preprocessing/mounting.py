@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.channel_table import STRAIGHT, axis_maps, axis_matrix
+from pipeline.io.axis_maps import STRAIGHT, axis_maps, axis_matrix
 from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.preprocessing.bench import (
     UP_AT_QUARTER_TURN,

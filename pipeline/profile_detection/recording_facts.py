@@ -1,7 +1,4 @@
-"""Describe a recording in lines for the terminal: time, channels, rests, clipping, units, notes and topics.
-
-The topics of an unknown message log also become layouts of columns, which only serve to propose a profile.
-"""
+"""Describe a recording in lines for the terminal: time, channels, rests, clipping, units, notes and topics."""
 
 from __future__ import annotations
 
@@ -11,19 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from imu_logs.files import MESSAGE_FORMATS
+from imu_logs.guesses import BURST_INTERVAL_DIFFERENCE
+from imu_logs.mcap_file import McapReader
+from imu_logs.message_decoder import ARRAYS, KINDS, object_decoder, ros_layouts
+from imu_logs.message_layout import short_name
+from imu_logs.message_logs import open_reader
+from imu_logs.message_read import LONGEST_ARRAY
+from imu_logs.units import DEGREES, TRIADS
 from pipeline.errors import IngestError
-from pipeline.io.field_path import STAMPS
-from pipeline.io.files import MESSAGE_FORMATS
 from pipeline.io.gravity_rotation import FAILS_DEG, FITS_DEG, misfit_deg, moves_of, rests_of
-from pipeline.io.mcap_reader import McapReader
-from pipeline.io.message_decoder import ARRAYS, KINDS, STATED, object_decoder, ros_layouts
-from pipeline.io.message_layout import short_name
-from pipeline.io.message_logs import open_reader
 from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
-from pipeline.io.units import DEGREES, TRIADS
 from pipeline.preprocessing.bench import other_axes
-from pipeline.profile_detection.columns import MAX_PARSED_ROWS, MIN_ROWS, Log, find_columns
-from pipeline.profile_detection.unit_guesses import BURST_INTERVAL_DIFFERENCE, FEWEST_RESTS_FOR_A_SPHERE, sphere
+from pipeline.profile_detection.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS
 from pipeline.signal.rests import rests_from_table, runs
 
@@ -34,8 +31,6 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
     from pipeline.io.gravity_rotation import MoveByHand
-    from pipeline.io.mcap_chunk import ChannelMessages
-    from pipeline.io.mcap_reader import MessageReader
     from pipeline.records import Note, Recording, Values
     from pipeline.settings import Sensor
 
@@ -46,9 +41,7 @@ DECISIVE_RATIO = 2.0  # of the misfits of two units of the rates, from which the
 LABEL_WIDTH = 16  # width of the labels, characters
 WIDTH = 118  # characters of a line
 LISTED_NOTES = 20  # fit one screen; the others are counted
-LONGEST_ARRAY = 16  # elements of a field that may be readings
 LONGEST_LIST = 4  # elements of an array that are listed
-OF_ARRAYS = ("HDF5", "MATLAB")  # formats whose arrays a user names
 MAX_LISTED_FIELDS = 24  # of a message that are listed
 MOST_TOPICS = 20  # with a line each
 
@@ -268,49 +261,6 @@ def _notes(notes: Sequence[Note]) -> list[str]:
 def _number(value: float, digits: int = 4) -> str:
     text = f"{value:.{digits}g}"
     return f"{value:.0f}" if "e" in text and 1 <= abs(value) < 1e7 else text
-
-
-def topics_of(path: Path) -> list[Log]:
-    """Return the topics of a log as columns, most sensors first; raises ``IngestError`` if none may hold readings."""
-    topics: dict[int, Log] = {}
-    listed = []
-    with open_reader(path) as reader:
-        for rows in reader.rows():
-            if rows.channel not in topics and (log := _topic(reader, rows)) is not None:
-                topics[rows.channel] = log
-        listed = [f"{c.topic} ({reader.counts[n]})" for n, c in reader.channels.items()]
-    best = sorted(topics.values(), key=lambda t: (-len(find_columns(t).triads), -len(next(iter(t.numbers.values())))))
-    if not best or not find_columns(best[0]).triads:
-        message = f"no topic holds the three axes of a sensor; the file has {', '.join(listed) or 'no topics'}"
-        raise IngestError(message, str(path), code="no_table")
-    return best
-
-
-def _topic(reader: MessageReader, rows: ChannelMessages) -> Log | None:
-    """Return the messages of a topic as columns; None if they are too few, vary in length or have no numbers."""
-    channel = reader.channels[rows.channel]
-    schema = reader.schemas.get(channel.schema_id)
-    try:
-        find = ros_layouts(channel, schema)
-        layout = find(rows.payload(0)) if find is not None and len(rows.starts) >= MIN_ROWS else None
-    except (ValueError, KeyError):  # an invalid definition, or a message that contradicts it
-        return None
-    if layout is None or not layout.places or len(layout.matching(rows)) < len(rows.starts):
-        return None
-    arrays = layout.columns(rows, layout.elements(LONGEST_ARRAY))
-    columns: dict[str, Any] = {n: c[:MAX_PARSED_ROWS].astype(np.float64) for n, c in arrays.items()}
-    for seconds, nanos in STAMPS:
-        for base in [n.removesuffix(f".{seconds}") for n in columns if n.endswith(f".{seconds}")]:
-            if f"{base}.{nanos}" in columns:
-                columns[base] = columns.pop(f"{base}.{seconds}") + columns.pop(f"{base}.{nanos}") / 1e9
-    fields = list(columns)
-    stated = [channel.metadata.get(STATED + f.partition("[")[0], "") for f in fields]
-    names = [f"{f} [{unit}]" if unit else f for f, unit in zip(fields, stated, strict=True)]
-    numbers = {i: columns[f] for i, f in enumerate(fields) if np.isfinite(columns[f]).all()}
-    section = {"header": True, "rate_hz": None}
-    named_by_user = schema is not None and schema.name in OF_ARRAYS
-    log = Log(reader.path, section, [*fields], names, numbers, topic=channel.topic, arrays=named_by_user)
-    return log if numbers else None
 
 
 def topic_lines(path: Path, *, fields: bool) -> list[Line]:

@@ -1,36 +1,46 @@
-"""Guess the units of the numbers in an unknown log, each with its evidence.
+"""Guess the units of the numbers in an unknown log from its motion, each with its evidence (``imu_logs.guesses``).
 
 specific force : |f| at rest is 1 in g, 9.8 in m/s^2, 1000 in mg; in counts, it is the number of counts per g
 angular rate   : the unit in which the integrated rates rotate gravity from rest to rest (``gravity_rotation``)
-time           : intervals of sensors are 0.05 to 200 ms long
 encoder        : gravity turns with the table, f = c + a cos(2 pi n / N) + b sin(2 pi n / N), with N counts per turn,
                  360 for degrees; about a vertical shaft, the gyroscope determines N to within its scale factor
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from pipeline.io.gravity_rotation import misfit_deg, rests_of
-from pipeline.io.units import COUNTS, DEGREES, FORCE_UNITS, UNITS
-from pipeline.profile_detection.columns import NO_SENSOR, OFFSETS, stated_unit, whole, words_of
+from imu_logs import proposal
+from imu_logs.columns import NO_SENSOR, OFFSETS, stated_unit, whole, words_of
+from imu_logs.guesses import (
+    ASSUMED_HZ,
+    CENTIDEGREES,
+    LOW_COST_ERROR,
+    OF_SENSOR,
+    TO_DECIDE,
+    TURN_OF,
+    Evidence,
+    Guess,
+    even_steps,
+    force_by_size,
+    rate_by_size,
+    unit_of_turn,
+)
+from imu_logs.units import COUNTS, DEGREES, UNITS
+from pipeline.io.gravity_rotation import MoveByHand, interval_of, misfit_deg, moves_of, rests_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.io.gravity_rotation import MoveByHand
-    from pipeline.profile_detection.columns import Columns
+    from imu_logs.columns import Columns, UnknownLog
+    from imu_logs.proposal import Proposal
     from pipeline.records import Values
     from pipeline.settings import Sensor
 
-TO_DECIDE = "???"
-OF_SENSOR = "${{sensor.{}.counts_per_unit}}"  # in a profile: a reference to the configuration of the sensor
-MPU60X0_TEMPERATURE = {"counts_per_unit": 340.0, "offset": -12420.2}  # MPU-6000/6050 register map 4.2, 4.18
-LOW_COST_ERROR = 0.12  # bias and scale factor of a low-cost sensor in one position
 CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and misalignment on the table
 SLOWEST = 1.0  # deg/s rms of a table: below, noise and bias wander are larger
 LARGEST_RESIDUAL = 0.3  # rms of the rates after the fit of the table's rate, of before: misalignment and noise
@@ -38,20 +48,12 @@ CLOSE_BY_TURNS = 0.2  # bias and scale factor of both sensors, in few moves
 USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)  # 2, 4, 8, 16 g in 16 bits, and 12 or 10 bits
 # 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch); whole mdps (drivers of STMicroelectronics).
 USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2, 1000.0)
-MAX_LINE_DEPARTURE = 0.02  # largest departure from a straight line, of the span
 COUNT_GRID = np.geomspace(1.0, 1000.0, 481)  # grid of counts per deg/s, in steps of 1.4 %
-ASSUMED_HZ = 100.0  # if the time is unknown
 CONVINCING_DEG = 12.0  # below half of the residual angle of the next usual scale in a quarter turn
-TOO_FAST_FOR_RADIANS = 40.0  # rad/s, 2300 deg/s: beyond the range of usual sensors
-BURST_INTERVAL_DIFFERENCE = 0.1  # relative difference of mean and median interval, from which both are stated
-RATES_HZ = (5.0, 20_000.0)  # sampling rates of inertial sensors
-SINCE_1970_S = (1e9, 4e9)  # 2001 to 2096
 FLATTEST = 0.1  # smallest over largest extent of rests in a plane: misalignment and scale factors are some percent
 FEWEST_RESTS_FOR_A_SPHERE = 9  # twice the four unknowns, and one
 
-CENTIDEGREES = "cdeg"  # in the name of a table's angle
 NO_ENCODER = NO_SENSOR | {"roll", "pitch", "yaw", "heading", "tilt", "quat"}  # estimates of a sensor, as angle_x
-TURN_OF = {"deg": 360.0, "rad": 2.0 * np.pi}  # a turn in units of angle
 # Counts per turn of encoders: 8 to 20 bits, and usual numbers of lines, once, twice and four times.
 ENCODERS = (
     *(2**bits for bits in range(8, 21)),
@@ -62,42 +64,6 @@ LARGEST_MISFIT = 0.1  # of the fit of gravity, of the force's rms: misalignment,
 SHORTEST_TURN = 0.9  # of a turn; with half a turn, other columns could fit as an angle
 SEARCHED = 0.1  # relative range about a usual number of counts, for numbers between them
 MOST_FITTED = 20_000  # rows; limits the time
-
-
-@dataclass(frozen=True)
-class Guess:
-    """A guess of the unit of a column."""
-
-    entry: dict[str, Any]  # of a profile; ``???`` marks a value that the user must fill in
-    evidence: str
-    second_s: float | None = None  # length of the unit of a time, s
-    centre: Values = field(default_factory=lambda: np.zeros(3))  # of the sphere through the rests: offset and bias
-
-
-def time_unit(values: Values, stated: str | None, why: str) -> Guess:
-    """Return the unit of a time."""
-    steps = np.diff(values)
-    step = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
-    seconds = {unit: length / 1e9 for unit, (length, _) in UNITS["time"].items() if unit != COUNTS}
-    mean = float(np.mean(steps)) if len(steps) and np.all(steps >= 0) else step
-
-    def on_average(second: float) -> str:
-        if not step or abs(mean / step - 1.0) < BURST_INTERVAL_DIFFERENCE:
-            return ""
-        return f" by the median interval and {1 / (mean * second):.4g} Hz on average: rows in bursts, or gaps"
-
-    if stated is not None:
-        rate = f", {1 / (step * seconds[stated]):.4g} Hz{on_average(seconds[stated])}" if step else ""
-        return Guess({"unit": stated}, why + rate, seconds[stated])
-    suits = [u for u, s in seconds.items() if step and RATES_HZ[0] <= 1 / (step * s) <= RATES_HZ[1]]
-    since = [u for u in suits if SINCE_1970_S[0] < float(values[0]) * seconds[u] < SINCE_1970_S[1]]
-    for unit in since or suits:
-        others = [f", or {u} at {1 / (step * seconds[u]):.4g} Hz" for u in suits if u != unit and not since]
-        what = "since 1970, in " if since else ""
-        rate = f"{1 / (step * seconds[unit]):.4g} Hz{on_average(seconds[unit])}"
-        evidence = f"{what}steps of {step:.6g}, so {unit} at {rate}{''.join(others)}"
-        return Guess({"unit": unit}, evidence, seconds[unit])
-    return Guess({"unit": TO_DECIDE}, f"steps of {step:g} suit no unit of time: s, ms, us or ns?")
 
 
 def force_unit(force: Values, interval_s: float) -> Guess:
@@ -112,13 +78,8 @@ def force_unit(force: Values, interval_s: float) -> Guess:
         spread = np.linalg.svd(means - means.mean(axis=0), compute_uv=False)
         if spread[2] > FLATTEST * spread[0]:  # rests of turns about one axis lie in a plane, on many spheres
             centre, radius = sphere(means)
-    if whole(force):
-        guess = _counts_per_g(len(rests), centre, radius, size, where)
-    else:
-        guess = Guess({"unit": TO_DECIDE}, f"{where}, which is neither 1 (g), 9.8 (m/s^2) nor 1000 (mg)")
-        for unit, gravity in FORCE_UNITS.items():
-            if abs(size / gravity - 1) < LOW_COST_ERROR:
-                guess = Guess({"unit": unit}, f"{where}, so {unit}")
+    counts = whole(force)
+    guess = _counts_per_g(len(rests), centre, radius, size, where) if counts else force_by_size(size, where)
     return replace(guess, centre=centre)
 
 
@@ -169,9 +130,7 @@ def rate_unit(rate: Values, moves: Sequence[MoveByHand], why_none: str, *, timed
         if misfit[best] > CONVINCING_DEG:
             return Guess({"unit": TO_DECIDE}, f"{text}, and no better otherwise: not convincing")
         return Guess({"unit": unit}, f"{text} (the other unit misses by {misfit[1 - best]:.0f} deg)")
-    if largest > TOO_FAST_FOR_RADIANS:
-        return Guess({"unit": "deg/s"}, f"up to {largest:.4g}, too fast for rad/s, so deg/s")
-    return Guess({"unit": TO_DECIDE}, f"up to {largest:.4g}; {why_none or 'the time is not known'}: deg/s or rad/s?")
+    return rate_by_size(largest, why_none or "the time is not known")
 
 
 def rate_unit_by_table(rate: Values, table_rate: Values) -> Guess | None:
@@ -249,22 +208,6 @@ def counts_of_sensor(guess: Guess, name: str, sensor: Sensor | None) -> Guess:
     return Guess({**guess.entry, "counts_per_unit": figure}, text)
 
 
-def even_steps(values: Values) -> bool:
-    """Return whether numbers grow evenly with the rows, like times and counters."""
-    line = np.linspace(values[0], values[-1], len(values))
-    return bool(np.ptp(values) > 0.0 and np.abs(values - line).max() < MAX_LINE_DEPARTURE * np.ptp(values))
-
-
-def temperature_counts(span: str, sensor: str) -> Guess:
-    """Return the entry of a temperature in counts; its scale and offset are only in the data sheet of the sensor."""
-    known = MPU60X0_TEMPERATURE if sensor.startswith("mpu60") else dict.fromkeys(MPU60X0_TEMPERATURE, TO_DECIDE)
-    evidence = (
-        f"whole numbers {span}, so counts: degC = (counts - offset) / counts_per_unit, both in the data sheet "
-        "(MPU-6000 and MPU-6050: degC = counts / 340 + 36.53, so counts_per_unit: 340, offset: -12420.2)"
-    )
-    return Guess({"unit": COUNTS, **known}, evidence)
-
-
 def find_encoder(
     parts: Sequence[Columns], force: Values | None, rate_dps: Values | None, time_s: Values | None
 ) -> None:
@@ -293,11 +236,6 @@ def find_encoder(
 def _is_estimate(words: Sequence[str]) -> bool:
     """Return whether a name is that of an angle which was computed from the readings, such as AngleX."""
     return bool(set(words) & NO_ENCODER) or ("angle" in words and bool(set(words) & {*"xyz"}))
-
-
-def unit_of_turn(turn: float) -> str:
-    """Return the unit of angle in which this is a turn; empty for a number of counts."""
-    return next((unit for unit, size in TURN_OF.items() if turn == size), "")
 
 
 def unit_by_table(columns: Columns, rate: Values, time_s: Values | None) -> Guess | None:
@@ -390,3 +328,43 @@ def _turn_by_gravity(counts: Values, force: Values) -> tuple[float, str] | None:
     if unit or not counted:
         return None
     return float(f"{measured:.4g}"), f"{seen} (no usual number)"
+
+
+class ByMotion(Evidence):
+    """The units by the motion of the log: gravity at rest, its rotation, a table's encoder, and the sensor's file."""
+
+    def __init__(self, model: Sensor | None = None) -> None:
+        self.model, self.sensor = model, model.name if model else ""
+
+    def force_unit(self, force: Values, time_s: Values | None) -> Guess:
+        """Return the unit of an (n, 3) specific force, from its size at rest."""
+        return force_unit(force, interval_of(np.diff(time_s)) if time_s is not None else 1 / ASSUMED_HZ)
+
+    def rate_unit(self, parts: Sequence[Columns], force: Values | None, rate: Values, time_s: Values | None) -> Guess:
+        """Return the unit of the rates from the table, from gravity, or, for counts, from the configuration."""
+        moves, why_none = list[MoveByHand](), "no accelerometer in the log that determines the unit"
+        if force is not None and not parts[0].steady:
+            why_none = "the rows are not one series in time, so the turns of gravity do not determine the unit"
+        elif force is not None:
+            moves = moves_of(force, rate, time_s if time_s is not None else np.arange(len(rate)) / ASSUMED_HZ)
+            why_none = "" if moves else "no move between rests rotates gravity, which would show the unit"
+        by_table = unit_by_table(next(c for c in parts if "gyroscope" in c.triads), rate, time_s)
+        guess = by_table or rate_unit(rate, moves, why_none, timed=time_s is not None)
+        if guess.entry["unit"] == COUNTS and guess.entry["counts_per_unit"] == TO_DECIDE:
+            return counts_of_sensor(guess, "gyroscope", self.model)
+        return guess
+
+    def find_encoder(
+        self, parts: Sequence[Columns], force: Values | None, rate_dps: Values | None, time_s: Values | None
+    ) -> None:
+        """Find the counts per turn of the named encoder, else a column that counts the turns of the readings."""
+        find_encoder(parts, force, rate_dps, time_s)
+
+    def remarks(self, force: Guess) -> list[str]:
+        """Return a remark if the accelerometer's counts differ from those of the stated sensor."""
+        return other_range(force, self.model)
+
+
+def propose(logs: Sequence[UnknownLog], model: Sensor | None = None) -> list[Proposal]:
+    """Return a proposal for each layout among the logs (``imu_logs.proposal``); ``model``: of the sensor, if stated."""
+    return proposal.propose(logs, ByMotion(model))

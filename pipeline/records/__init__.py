@@ -1,5 +1,7 @@
 """The data that stages pass to each other: recordings, motions, noise and calibrations (frozen dataclasses)."""
 
+from imu_logs.log import Index, Integers, Mask, Note, Values
+from imu_logs.units import AXES, SENSOR_UNITS, SENSORS
 from pipeline.records.budget import (
     LIMIT,
     MONTE_CARLO,
@@ -47,7 +49,6 @@ from pipeline.records.parameters import (
     MATRIX,
     MATRIX_NAMES,
     MATRIX_ROWS,
-    SENSOR_UNITS,
     Estimate,
     Parameters,
     base_units,
@@ -57,18 +58,11 @@ from pipeline.records.parameters import (
     standard_uncertainty,
 )
 from pipeline.records.recording import (
-    AXES,
     MEDIAN_SIZE,
-    SENSORS,
-    Index,
-    Integers,
-    Mask,
     Motion,
     Noise,
-    Note,
     Recording,
     UnitRecordings,
-    Values,
     WanderLikelihood,
     conjugate_product,
     continuous,

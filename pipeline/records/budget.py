@@ -12,8 +12,8 @@ from pipeline.records.parameters import standard_uncertainty
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from imu_logs.log import Mask, Values
     from pipeline.records.parameters import Parameters
-    from pipeline.records.recording import Mask, Values
 
 NORMAL, RECTANGULAR = "normal", "rectangular"
 LIMIT = "misalignment not determined by the rests: limit of the sensor file"  # a source of the uncertainty budget

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
+from imu_logs.units import SENSOR_UNITS
 from pipeline.records.budget import Budget, BudgetLine, finite, unlimited
 from pipeline.records.correction import Step, published, steps_of
 from pipeline.records.parameters import (
     BASE_NAMES,
     BIAS,
-    SENSOR_UNITS,
     Estimate,
     Parameters,
     base_units,
@@ -27,7 +27,7 @@ from pipeline.records.parameters import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.records.recording import Values
+    from imu_logs.log import Values
 
 SCHEMA_VERSION = 2  # of published documents; the keys of each version are in pipeline/schemas
 READABLE_VERSIONS = (1, 2)  # a key that a document of version 1 lacks counts as null

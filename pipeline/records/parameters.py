@@ -11,16 +11,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records.recording import AXES
+from imu_logs.units import AXES, SENSOR_UNITS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import ArrayLike
 
-    from pipeline.records.recording import Index, Values
+    from imu_logs.log import Index, Values
 
-SENSOR_UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 BIAS_NAMES = tuple(f"bias_{axis}" for axis in AXES)
 MATRIX_NAMES = tuple(f"matrix_{row}{column}" for row in AXES for column in AXES)
 BASE_NAMES = BIAS_NAMES + MATRIX_NAMES

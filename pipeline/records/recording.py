@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
@@ -29,16 +29,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-# Types of arrays: quantities, masks of samples, integers, indices of samples.
-Values: TypeAlias = "NDArray[np.float64]"
-Mask: TypeAlias = "NDArray[np.bool_]"
-Integers: TypeAlias = "NDArray[np.int64]"
-Index: TypeAlias = "NDArray[np.intp]"
+    from imu_logs.log import Integers, Mask, Note, Values
+
 Quantity = TypeVar("Quantity")
 Arguments = ParamSpec("Arguments")
 
-AXES = ("x", "y", "z")
-SENSORS = ("accelerometer", "gyroscope")
 NANOSECONDS = 1_000_000_000
 CLIPPED_OR_STUCK = 0b110  # bits 1 and 2 of ``Recording.flags``
 # Arrays of a recording with a row for each sample.
@@ -47,34 +42,6 @@ OF_SAMPLES = (
 )  # fmt: skip
 MEDIAN_SIZE = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise with standard deviation 1: 0.67449 sqrt(2)
-
-
-@dataclass(frozen=True)
-class Note:
-    """A machine-readable remark on an input: what was found or repaired, how often and where.
-
-    ``first`` and ``last`` are line numbers in the file, from 1, or 0 if lines do not apply. ``start_s`` and ``end_s``
-    are the times of the first and the last sample concerned, in the clock of the file. ``settings``: the overrides that
-    state what was found, so that it is no longer noted; alternatives, each of one or more overrides.
-    """
-
-    code: str
-    count: int
-    first: int
-    last: int
-    detail: str
-    start_s: float | None = None
-    end_s: float | None = None
-    settings: tuple[tuple[str, ...], ...] = ()
-
-    @classmethod
-    def of(cls, entry: dict[str, Any]) -> Note:
-        """Return the note of an entry that ``to_json`` made."""
-        return cls(**{**entry, "settings": tuple(map(tuple, entry.get("settings", ())))})
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields, without empty ``settings``."""
-        return {key: value for key, value in vars(self).items() if key != "settings" or value}
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from imu_logs.units import SENSORS
 from pipeline.records.calibration import SCHEMA_VERSION
-from pipeline.records.recording import SENSORS, Noise
+from pipeline.records.recording import Noise
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

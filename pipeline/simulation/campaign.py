@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.errors import ConfigurationError
-from pipeline.io.arrow import write_canonical_csv
+from pipeline.io.write import write_recording
 from pipeline.records import AXES, SENSORS
 from pipeline.simulation.description import course_of, shipped_settings
 from pipeline.simulation.procedures import ONE_RECORDING, plan
@@ -179,16 +179,14 @@ def _selected(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:
 def _write_recording(folder: Path, recording: Recording, kind: str, sensor_model: Sensor) -> None:
     """Write one recording as ``<name>.csv`` or ``<name>.mcap``, in the axes of the unit's body."""
     if kind == "mcap":
-        from pipeline.io.ros2_messages import write_mcap  # noqa: PLC0415  (needs the mcap library)
-
-        write_mcap(folder / f"{recording.name}.mcap", recording)
+        write_recording(folder / f"{recording.name}.mcap", recording)
         return
     wanted = {f"accel_{a}_g": decimals_of(sensor_model.accelerometer) for a in AXES}
     wanted |= {f"gyro_{a}_dps": decimals_of(sensor_model.gyroscope) for a in AXES}
     wanted |= {"temperature_degc": TEMPERATURE_DECIMALS}
     wanted |= dict.fromkeys(("table_angle_deg", "table_rate_dps"), ANGLE_DECIMALS)
     wanted |= {f"table_q{c}": QUATERNION_DECIMALS for c in "wxyz"}
-    write_canonical_csv(folder / f"{recording.name}.csv", recording, wanted)
+    write_recording(folder / f"{recording.name}.csv", recording, wanted)
 
 
 def _truth(sensor: SimulatedSensor, effects: Hidden, interval: float) -> dict[str, Any]:

@@ -26,10 +26,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from imu_logs.yaml_file import read_yaml
 from pipeline.errors import ConfigurationError, MissingInputError
 from pipeline.files import CONFIGS
 from pipeline.io.files import wrong_name
-from pipeline.io.yaml_file import read_yaml
 from pipeline.model.sensor_file import completed
 from pipeline.settings import SECTIONS, Settings
 from pipeline.simulation.procedures import (

@@ -17,7 +17,7 @@ from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineEr
 from pipeline.estimation.chip_fit import Chip
 from pipeline.estimation.chips import chip_document
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.io.channel_table import axis_maps
+from pipeline.io.axis_maps import axis_maps
 from pipeline.io.quality_flags import GAP
 from pipeline.model.calibration_file import beyond_limits, implausible, not_determined
 from pipeline.model.open_effects import with_open

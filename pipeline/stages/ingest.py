@@ -8,8 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from imu_logs.files import unchanged
 from pipeline.errors import IngestError, PipelineError, failure_of
-from pipeline.io.files import candidate_files, recording_files, unchanged
+from pipeline.io.files import candidate_files, recording_files
 from pipeline.io.read import read_recordings
 from pipeline.pack import FAILED, Pack, as_bytes, new_pack
 from pipeline.preprocessing.checks import check_recordings

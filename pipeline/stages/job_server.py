@@ -83,7 +83,7 @@ def _prepare() -> None:
         "scipy.interpolate",
         "scipy.spatial.transform",
         "imufusion",
-        "pipeline.io.csv_read",
+        "imu_logs.text_read",
         "encodings.cp437",
     ):
         import_module(module)  # stages import them inside functions

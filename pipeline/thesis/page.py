@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.io.yaml_file import read_yaml
+from imu_logs.yaml_file import read_yaml
 from pipeline.records import SENSOR_UNITS
 from pipeline.records.correction import corrected, steps_of
 from pipeline.report.chart import AXES_LEGEND, Figure, Panel, SampleMarks, chart

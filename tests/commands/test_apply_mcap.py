@@ -16,11 +16,11 @@ from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from unit_settings import ingest_of
 
+from imu_logs.mcap_write import DEFINITIONS, IMU, TEMPERATURE
 from pipeline.commands.apply import main
 from pipeline.errors import InputError
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.field_logs.compensate import LogProfile, compensate_log
-from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE
 from pipeline.model.compensation import load
 from pipeline.records import SENSORS, FittedEffect, Recording, SensorCalibration
 

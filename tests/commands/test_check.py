@@ -13,8 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from pipeline.__main__ import main
-from pipeline.io.arrow import write_canonical_csv
-from pipeline.io.ros2_messages import write_mcap
+from pipeline.io.write import write_recording
 from pipeline.records import Recording
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import description_from
@@ -33,7 +32,7 @@ def make_log(samples: int = 1000) -> Recording:
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    write_canonical_csv(tmp_path / "log.csv", make_log())
+    write_recording(tmp_path / "log.csv", make_log())
     return tmp_path / "log.csv"
 
 
@@ -90,7 +89,7 @@ def test_notes_are_shown_with_code_and_line(log: Path, capsys: pytest.CaptureFix
 def test_a_log_of_ros_messages_is_told_with_its_topics_and_its_proof(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_mcap(tmp_path / "log.mcap", make_log())
+    write_recording(tmp_path / "log.mcap", make_log())
     checked = Checked(capsys, tmp_path / "log.mcap")
     assert checked.code == 0
     assert "1,000 messages in 1 chunk, written by imu-calibration; every checksum and count verified" in checked.words
@@ -99,7 +98,7 @@ def test_a_log_of_ros_messages_is_told_with_its_topics_and_its_proof(
 
 def test_a_damaged_mcap_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "log.mcap"
-    write_mcap(file, make_log())
+    write_recording(file, make_log())
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 4
     file.write_bytes(bytes(data))
@@ -417,7 +416,7 @@ def test_slow_full_turns_of_a_table_are_no_rests_and_no_contradiction(
     speed = np.gradient(turned, 1.0 / rate)
     gyro = np.column_stack([np.zeros(n), np.zeros(n), speed]) + 0.04 * rng.standard_normal((n, 3))
     slow = Recording("slow", "rests", None, 8_000_000 * np.arange(n), accelerometer=force, gyroscope=gyro)
-    write_canonical_csv(tmp_path / "slow.csv", slow)
+    write_recording(tmp_path / "slow.csv", slow)
     words = Checked(capsys, tmp_path / "slow.csv").words
     assert "no move between rests turns gravity" in words
     assert re.search(r"rests 2, 7\.9\d* to 7\.9\d* s long", words)
@@ -442,7 +441,7 @@ def test_a_wrong_unit_of_few_moves_and_swapped_axes_are_told(
     def words(rates: np.ndarray, rows: int) -> str:
         times = 10_000_000 * np.arange(rows)
         log = Recording("log", "rests", None, times, accelerometer=f[:rows], gyroscope=rates[:rows])
-        write_canonical_csv(tmp_path / "log.csv", log)
+        write_recording(tmp_path / "log.csv", log)
         return Checked(capsys, tmp_path / "log.csv").words
 
     w += 0.05 * rng.standard_normal(w.shape)

@@ -17,7 +17,7 @@ from pipeline.estimation.noise_identification import identify_noise
 from pipeline.field_logs import ros2_node
 from pipeline.field_logs.ros2_node import MessageCalibrator
 from pipeline.files import write_json
-from pipeline.io.ros2_messages import write_mcap
+from pipeline.io.write import write_recording
 from pipeline.records import FittedEffect, Recording, SensorCalibration
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def log(tmp_path: Path) -> Path:
     rng = np.random.default_rng(4)
     time = (2_000_000 * np.arange(SAMPLES)).astype(np.int64) + 10**18
     force, rate = rng.normal(0, 1, (SAMPLES, 3)), rng.normal(0, 50, (SAMPLES, 3))
-    write_mcap(
+    write_recording(
         tmp_path / "drive.mcap", Recording("drive", "rests", None, time, force, rate, 30 + 1e-3 * np.arange(SAMPLES))
     )
     return tmp_path / "drive.mcap"

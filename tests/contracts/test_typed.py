@@ -18,12 +18,11 @@ SECTIONS = {n for n, kind in vars(pipeline.settings).items() if isinstance(kind,
 # Modules and packages with functions that take JSON, by the reason.
 TAKE_JSON = {
     "the configuration, effects, profiles and simulations as files state them, before they are checked": (
-        "commands/config.py", "config/", "io/ingest_settings.py",
-        "model/effects/", "model/sensor_file.py", "settings.py", "simulation/",
+        "commands/config.py", "config/", "model/effects/", "model/sensor_file.py", "settings.py", "simulation/",
     ),
     "documents of a run: written, read, and shown on pages, by commands and in formats of other programs": (
         "commands/explain.py", "commands/noise.py", "diagnosis/words.py", "exports/", "field_logs/compensate.py",
-        "history.py", "io/arrow.py", "io/channel_table.py", "io/digests.py", "model/calibration_file.py",
+        "history.py", "io/arrow.py", "io/axis_maps.py", "io/digests.py", "model/calibration_file.py",
         "model/compensation.py", "model/open_effects.py", "outcome.py", "planning/plan.py", "records/", "report/",
         "result.py", "results_folder.py", "stages/", "study/result.py", "thesis/page.py",
     ),

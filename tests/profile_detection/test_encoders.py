@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from loggers import GRAVITY
 
-from pipeline.profile_detection.columns import find_layout
-from pipeline.profile_detection.profile_text import as_yaml, not_found
-from pipeline.profile_detection.proposal import Proposal, propose
+from imu_logs.columns import find_layout
+from imu_logs.proposal import Proposal, as_yaml, not_found
+from pipeline.profile_detection.unit_guesses import propose
 
 HZ = 125.0
 RATE = np.repeat(

@@ -11,13 +11,13 @@ import yaml
 from loggers import GRAVITY, INTERVAL_S, LOGGERS, Logger, motion
 from unit_settings import ingest_of
 
+from imu_logs.columns import find_layout
+from imu_logs.profile import Checks, csv_formats
+from imu_logs.proposal import Proposal, as_yaml
+from imu_logs.text_read import read_csv
 from pipeline.config.compose import Composer
 from pipeline.errors import IngestError
-from pipeline.io.csv_read import read_csv
-from pipeline.io.ingest_settings import Checks, csv_formats
-from pipeline.profile_detection.columns import find_layout
-from pipeline.profile_detection.profile_text import as_yaml
-from pipeline.profile_detection.proposal import Proposal, propose
+from pipeline.profile_detection.unit_guesses import propose
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "data"
 
@@ -227,7 +227,7 @@ def test_a_temperature_called_t_beside_times_in_ms_is_no_time(tmp_path: Path, de
     assert columns["time"] == {"column": "ms", "unit": "ms"}
     assert columns["temperature"] == {"column": "T", "unit": "degC", "optional": True}
     assert (columns["accel_x"]["counts_per_unit"], columns["gyro_z"]["counts_per_unit"]) == (4096.0, 65.5)
-    table = read_csv([file], csv_formats(ingest_of(proposal.ingest("mine", None))))
+    table = read_csv([file], csv_formats(proposal.profile("mine")))
     np.testing.assert_allclose(table.time_ns, time_s * 1e9, rtol=0, atol=1000)
     np.testing.assert_allclose(table.values["table_angle"], angle, rtol=0, atol=0.006)
     np.testing.assert_allclose(table.values["gyro_x"], rate, rtol=0, atol=0.008)
@@ -250,7 +250,7 @@ def test_units_of_samples_in_bursts_are_found_by_their_regular_clock(tmp_path: P
     assert proposal.complete, proposal.evidence
     assert proposal.columns[0]["gyro_x"]["unit"] == "deg/s"
     assert "rows in bursts" in proposal.evidence["time"]
-    table = read_csv([file], csv_formats(ingest_of(proposal.ingest("mine", None))))
+    table = read_csv([file], csv_formats(proposal.profile("mine")))
     assert [n.code for n in table.notes] == ["N-BURSTS"]
     assert np.diff(table.time_ns) == pytest.approx(np.full(len(data) - 1, 1e7), rel=1e-3)
 
@@ -300,9 +300,9 @@ def test_a_matlab_file_of_hdf5_is_named(tmp_path: Path) -> None:
                         "csv": {
                             "rate_hz": 1.0,
                             "columns": {c: {"column": c, "unit": "g"} for c in ("accel_x", "accel_y", "accel_z")},
-                        }
-                    }
-                )
+                        },
+                    },
+                ),
             ),
         )
 

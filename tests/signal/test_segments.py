@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from imu_logs.log import Log
+from imu_logs.profile import Checks
 from pipeline.errors import InputError
-from pipeline.io.channel_table import ChannelTable
 from pipeline.io.encoder_log import unwrapped
-from pipeline.io.ingest_settings import Checks
 from pipeline.io.read import to_recording
 from pipeline.records import rate_of_attitude
 from pipeline.settings import RecordingFile, Window
@@ -171,7 +171,7 @@ def test_an_attitude_alone_gives_the_rate_of_held_out_motion() -> None:
     part = next(r for r in cut(session()) if r.name == "validation")
     assert part.table_attitude is not None
     values = {f"table_q{c}": part.table_attitude[:, i] for i, c in enumerate("wxyz")}
-    table = ChannelTable("log", part.time_ns, values, {"file": "log"})
+    table = Log("log", part.time_ns, values, {"file": "log"})
     entry = RecordingFile(file="validation", role="validation", axis=None, optional=False)
     read = to_recording("validation", entry, unwrapped(table), None, Checks())
     assert read.table_rate is not None

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from unit_settings import filter_of
 
-from pipeline.io.yaml_file import read_yaml
+from imu_logs.yaml_file import read_yaml
 from pipeline.records import Recording
 from pipeline.signal.filters import apply_filter
 from pipeline.thesis.findings import CONFIRMED, REFUTED, agreements, conclusions, gain_of_filter, scatters

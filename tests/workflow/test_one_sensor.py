@@ -16,7 +16,7 @@ import pipeline
 from pipeline.commands import apply, simulate
 from pipeline.config import load_campaign
 from pipeline.errors import ConfigurationError
-from pipeline.io.ros2_messages import write_mcap
+from pipeline.io.write import write_recording
 from pipeline.records import Recording
 
 from .conftest import Bench
@@ -48,7 +48,7 @@ def as_mcap(source: Path, target: Path) -> None:
     rows = np.genfromtxt(source, delimiter=",", names=True)
     time = np.rint(rows["time_s"] * 1e9).astype(np.int64)
     force = np.column_stack([rows[f"accel_{axis}_g"] for axis in "xyz"])
-    write_mcap(target, Recording("recording", "rests", None, time, force, None, rows["temperature_degc"]))
+    write_recording(target, Recording("recording", "rests", None, time, force, None, rows["temperature_degc"]))
 
 
 def simulated(directory: Path, *options: str) -> Path:

@@ -16,12 +16,12 @@ pytestmark = [
     pytest.mark.workflow,
     pytest.mark.skipif(int(version("setuptools").split(".")[0]) < 77, reason="setuptools>=77 builds the wheel"),
 ]
-BUILT_FROM = ("pipeline", "imu_calibration", "configs", "workflow", "profiles", "data/demo")
+BUILT_FROM = ("pipeline", "imu_calibration", "imu_logs", "configs", "workflow", "profiles", "data/demo")
 OF_THE_TOP = (
     "pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE", "Snakefile", "CHANGELOG.md",
     "requirements.lock",
 )  # fmt: skip
-PACKAGES, SHIPPED = BUILT_FROM[:2], BUILT_FROM[2:]
+PACKAGES, SHIPPED = BUILT_FROM[:3], BUILT_FROM[3:]
 PIPELINE = ("-m", "pipeline")
 BUILD = "import sys; from setuptools import build_meta as b; to = sys.argv[1]; b.build_wheel(to); b.build_sdist(to)"
 
@@ -68,6 +68,8 @@ def test_the_wheel_holds_the_package_the_rules_the_configurations_and_the_demo(i
     assert files(installed, *PACKAGES) >= files(ROOT, *PACKAGES)
     shipped = installed / "pipeline" / "shipped"
     assert files(shipped, *SHIPPED) == files(ROOT, *SHIPPED)
+    profiles = {f.name for f in (ROOT / "configs" / "ingest").glob("*.yaml")}
+    assert {f.name for f in (installed / "imu_logs" / "profiles").glob("*.yaml")} == profiles
     (entry_points,) = installed.glob("*.dist-info/entry_points.txt")
     assert "imu-calibration = pipeline.__main__:main" in entry_points.read_text()
     assert not (installed / "tests").exists()

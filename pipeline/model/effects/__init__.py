@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from imu_logs.files import read_text
+from imu_logs.yaml_file import load_yaml
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
 from pipeline.files import CONFIGS
-from pipeline.io.files import read_text
-from pipeline.io.yaml_file import load_yaml
 from pipeline.model.effects.base import Effect
 from pipeline.model.effects.declaration import read_declaration
 from pipeline.model.effects.formula_effect import FormulaEffect

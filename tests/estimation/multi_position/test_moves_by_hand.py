@@ -11,6 +11,9 @@ from hand_session import hand_held
 from scipy.special import stdtrit
 from unit_settings import settings_of, with_noise
 
+from imu_logs.log import Log
+from imu_logs.profile import Checks
+from imu_logs.units import TRIADS
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.effects import fit as fit_effects
@@ -18,10 +21,7 @@ from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.multi_position.gyroscope import model_of
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.moves import to_the_end
-from pipeline.io.channel_table import ChannelTable
-from pipeline.io.ingest_settings import Checks
 from pipeline.io.quality_flags import examine
-from pipeline.io.units import TRIADS
 from pipeline.model.effects import effect
 from pipeline.simulation.trajectory import rotation_about
 
@@ -138,7 +138,7 @@ def test_moves_that_are_clipped_below_the_stated_range_are_left_out_and_named(sh
     clipped = replace(whole, gyroscope=np.clip(whole.gyroscope, -end, end))
     channels = {sensor: clipped.reading(sensor) for sensor in TRIADS}
     values = {c: channels[s][:, k] for s, triad in TRIADS.items() for k, c in enumerate(triad)}
-    table = ChannelTable("log.csv", whole.time_ns, values, {}, np.arange(whole.samples), {})
+    table = Log("log.csv", whole.time_ns, values, {}, np.arange(whole.samples), {})
     flags, notes = examine(table, unit.settings.sensor, Checks())
     assert all(n.code == "N-CLIP" and n.detail.startswith("gyro_") for n in notes)
     assert flags is not None
@@ -160,7 +160,7 @@ def test_rests_at_the_end_of_the_readings_of_a_coarse_log_are_not_clipped() -> N
     for start in range(100, 1000, 100):  # moves in one direction alone
         rate[start : start + 30] += 60.0 * rng.uniform(size=3) * np.sin(np.linspace(0.0, np.pi, 30))[:, None]
     values = dict(zip(TRIADS["gyroscope"], (0.2 * np.round(rate / 0.2)).T, strict=True))
-    table = ChannelTable("log.csv", 10_000_000 * np.arange(1000), values, {}, np.arange(1000), {})
+    table = Log("log.csv", 10_000_000 * np.arange(1000), values, {}, np.arange(1000), {})
     flags, notes = examine(table, hand_held("mpu6050", 5).settings.sensor, Checks())
     assert notes == []
     assert flags is None or not flags.any()

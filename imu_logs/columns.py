@@ -1,0 +1,422 @@
+"""Find the layout of an unknown text log, and its likely columns of time, readings, temperature and table log.
+
+The result only serves to propose a profile. It is never applied without the user's request.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from imu_logs.errors import IngestError
+from imu_logs.profile import COMMENTED
+from imu_logs.units import BRACKETS, CHANNELS, SPELLINGS, TRIADS, UNITS, unit_in_brackets
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from imu_logs.log import Values
+
+    Triad = tuple[int, int, int]
+
+COUNTING = 0.98  # share of steps by exactly 1
+FEWEST_RISES = 4  # of a time, per fall; a noisy reading falls as often as it rises
+MAX_INTERVAL_SCATTER = 0.2  # of intervals, relative to their median: above, times are of arrival, not of sampling
+TEMPERATURE_RANGE = (-60.0, 130.0)  # degC, of electronics and their tests
+
+OFFSETS = (32768.0, 8192.0, 2048.0)  # middle of unsigned 16, 14 and 12 bits
+NEAR_OFFSET = 1 / 16  # of the offset, for median rates: 16 deg/s of +-250 deg/s, above usual biases
+
+WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d")
+MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|om|omega|rot|rate)([xyz])")
+AXIS_WORDS = ("x", "y", "z", "0", "1", "2", "3")
+SENSOR_WORDS = {
+    "accelerometer": {"a", "ac", "acc", "accl", "accel", "accelerometer", "acceleration", "f", "force"},
+    "gyroscope": {
+        "g", "gy", "gyr", "gyro", "gyroscope", "w", "om", "omega", "rotation", "rot", "angular", "rate", "rates",
+    },
+}  # fmt: skip
+NO_SENSOR = {"mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias"}
+TIME_FIRST = {
+    "t", "ts", "sec", "secs", "ms", "us", "ns", "msec", "usec", "nsec", "tow", "utc", "epoch", "elapsed", "date",
+    "uhrzeit",
+}  # fmt: skip
+TIME_WORDS = {
+    "time", "timestamp", "stamp", "datetime", "millis", "micros", "nanos", "seconds", "milliseconds", "microseconds",
+    "nanoseconds", "ticks", "zeit", "tiempo", "temps",
+}  # fmt: skip
+TABLE_WORDS = {"table", "turntable", "encoder", "enc", "shaft"}
+TEMPERATURE_WORDS = {"temp", "temperature", "tmp"}
+OTHER_TEMPERATURES = {"baro", "barometer", "battery", "cpu"}
+TABLE_CHANNEL_WORDS = {
+    "table_rate": {"rate", "speed", "velocity", "vel", "dps"},
+    "table_angle": {"angle", "position", "pos", "deg", "cdeg", "encoder", "enc"},
+}
+SQUARED = (["s"], ["ms"], ["mps"])  # words before a 2 that is an exponent, not an axis
+UNIT_ENDINGS = (
+    ("m/s^2", ("m s 2", "mps 2", "ms 2")), ("deg/s", ("dps", "deg s", "degps")),
+    ("rad/s", ("rad s", "rads", "radps", "rad")), ("degC", ("degc", "deg c", "c")), ("mg", ("mg",)), ("g", ("g",)),
+    ("s", ("s", "sec", "seconds")), ("ms", ("ms", "millis", "msec", "milliseconds")),
+    ("us", ("us", "micros", "usec", "microseconds")), ("ns", ("ns", "nanos", "nsec", "nanoseconds")), ("deg", ("deg",)),
+)  # fmt: skip
+LINES_TRIED = 400  # with each separator
+MAX_PARSED_ROWS = 200_000  # that are parsed; limits the time
+MIN_ROWS = MIN_COLUMNS = 3  # of the log of a three-axis sensor
+SEPARATORS = (",", ";", "\t", "|", " ")
+NUMBER = {
+    ".": re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"),
+    ",": re.compile(r"[+-]?(\d+,?\d*|,\d+)([eE][+-]?\d+)?"),
+}
+STATED_NUMBER = re.compile(r"[\s,;:=]+(\d+(\.\d+)?)\s*(hz)?\s*$", re.IGNORECASE)
+RATE_KEY = re.compile(r"(fs|odr|(sampl\w*[ _]?)?(rate|freq\w*))\b", re.IGNORECASE)
+
+
+@dataclass
+class Columns:
+    """The indices of the columns that probably contain the channels of a log."""
+
+    log: UnknownLog
+    time: int | None = None
+    counter: int | None = None  # of samples
+    arrival: int | None = None  # a time with scattering intervals; a counter without gaps then gives the time
+    triads: dict[str, Triad] = field(default_factory=dict)  # sensor to its x, y, z
+    others: dict[str, int] = field(default_factory=dict)  # temperature, table_angle ..
+    steady: bool = True  # time, or the counter of samples, never decreases
+    turn: tuple[float, str] | None = None  # counts per turn of the table's encoder, and the evidence
+    remarks: list[str] = field(default_factory=list)
+
+    def free(self) -> list[int]:
+        """Return the columns of numbers that are assigned to no channel."""
+        used = {*self.of_time(), *self.others.values(), *sum(self.triads.values(), ())}
+        return [i for i in self.log.numbers if i not in used]
+
+    def of_time(self) -> set[int]:
+        """Return the columns of the time, of a counter, and those that repeat it, as arrays of one recording may."""
+        numbers, taken = self.log.numbers, {self.time, self.counter, self.arrival} - {None}
+        return {i for i in numbers if any(np.array_equal(numbers[i], numbers[t]) for t in taken if t is not None)}
+
+
+def whole(values: Values) -> bool:
+    """Return whether all values are integers."""
+    return bool(np.all(values == np.rint(values)))
+
+
+def words_of(name: str) -> list[str]:
+    """Return the words of a name in lower case, without brackets at its end unless they contain an axis."""
+    bracket = BRACKETS.search(name)
+    axis = bracket is not None and bracket.group(1).strip().lower() in AXIS_WORDS
+    words = [w.lower() for w in WORD.findall(name if axis or bracket is None else name[: bracket.start()])]
+    merged = [(w, MERGED.fullmatch(w)) for w in words]
+    return [part for w, match in merged for part in (match.groups() if match else (w,))]
+
+
+def stated_unit(name: str, channel: str) -> tuple[str | None, str]:
+    """Return the unit that a name states for a channel, in brackets or in its last words, and the evidence."""
+    unit = unit_in_brackets(name)
+    words = [w.lower() for w in WORD.findall(name)]
+    while words and (words[-1] in ("x", "y", "z", "0", "1", "3") or (words[-1] == "2" and words[-2:-1] not in SQUARED)):
+        words = words[:-1]
+    ending = " ".join(words)
+    if unit not in UNITS[channel]:
+        matching = [
+            candidate
+            for candidate, spellings in UNIT_ENDINGS
+            for s in spellings
+            if candidate in UNITS[channel]
+            and (ending.endswith(f" {s}") or (ending == s and s in TIME_FIRST | TIME_WORDS))
+        ]
+        unit = matching[0] if matching else SPELLINGS.get(words[-1]) if len(words) > 1 else None
+    return (unit, f"the name says {unit}") if unit in UNITS[channel] else (None, "")
+
+
+def find_columns(log: UnknownLog) -> Columns:
+    """Return the columns that probably contain the channels of a log."""
+    columns = Columns(log)
+    words = {i: words_of(log.names[i]) if log.named else [] for i in log.numbers}
+    _find_time(columns, words)
+    times = columns.of_time()
+    for sensor in (*TRIADS, "?"):
+        named = {i: w for i, w in words.items() if i not in times and _sensor_of(w) == sensor}
+        triad = _triad(named)
+        if triad is not None:
+            columns.triads[sensor] = triad
+            _remark_on_other_triads(columns, sensor, named)
+    for sensor, triad in _triads_by_one_letter(log).items():
+        if not times & set(triad):
+            columns.triads.setdefault(sensor, triad)
+    axes_only = columns.triads.pop("?", None)
+    if axes_only is not None and not columns.triads:
+        columns.triads[_sensor_of_file(log, axes_only)] = axes_only
+        columns.remarks.append(f"taken as the {next(iter(columns.triads))} by the file's name and numbers; check it")
+    if not log.named or (log.arrays and not columns.triads):
+        _find_triads_without_names(columns)
+    for i, w in words.items():
+        channel = _other_channel(log.names[i], w)
+        low, high = TEMPERATURE_RANGE
+        values = log.numbers[i]
+        possible = low < float(np.median(values)) < high
+        if channel and channel not in columns.others and (channel != "temperature" or possible or whole(values)):
+            columns.others[channel] = i
+        elif w == ["t"] and possible and not _advances(values):  # a column called T, which could also be a time
+            columns.others.setdefault("temperature", i)
+    return columns
+
+
+def _triads_by_one_letter(log: UnknownLog) -> dict[str, Triad]:
+    """Find triads of names that differ in one letter x, y, z next to the name of a sensor: axr, ayr, azr."""
+    groups: dict[tuple[str, str], dict[str, int]] = {}
+    for index in log.numbers if log.named else ():
+        name = log.names[index].lower()
+        for at in (i for i, letter in enumerate(name) if letter in "xyz"):
+            groups.setdefault((name[:at], name[at + 1 :]), {})[name[at]] = index
+    triads: dict[str, Triad] = {}
+    for (before, after), axes in groups.items():
+        adjacent = {*re.findall("[a-z]+$", before), *re.findall("^[a-z]+", after)}
+        for sensor, sensor_words in SENSOR_WORDS.items():
+            if len(axes) == len("xyz") and adjacent & sensor_words:
+                triads.setdefault(sensor, (axes["x"], axes["y"], axes["z"]))
+    return triads
+
+
+def _axis_of(words: list[str]) -> str:
+    """Return the last word that is an axis; empty for none."""
+    return next((w for w in reversed(words) if w in AXIS_WORDS), "")
+
+
+def _sensor_of(words: list[str]) -> str:
+    """Return the sensor that a name states, empty for none, ``?`` if the name is only an axis."""
+    axis = _axis_of(words)
+    if not axis or set(words) & NO_SENSOR:
+        return ""
+    before = words[: len(words) - 1 - words[::-1].index(axis)]
+    return next((s for s, known in SENSOR_WORDS.items() if set(before) & known), "" if before else "?")
+
+
+def _other_channel(name: str, words: list[str]) -> str:
+    """Return the channel other than time and readings that a name states, empty for none."""
+    canonical = [c for c in CHANNELS[6:] if name.lower().startswith(c)]
+    if canonical:
+        return canonical[0]
+    if set(words) & TEMPERATURE_WORDS and not set(words) & OTHER_TEMPERATURES:
+        return "temperature"
+    if set(words) & TABLE_WORDS:
+        return next((c for c, known in TABLE_CHANNEL_WORDS.items() if set(words) & known), "")
+    return ""
+
+
+def _find_time(columns: Columns, words: dict[int, list[str]]) -> None:
+    """Find the column of the time, or of a counter of samples."""
+    numbers = columns.log.numbers
+    rising = [i for i, v in numbers.items() if len(v) > 2 and bool(np.all(np.diff(v) > 0))]
+    counters = [i for i, v in numbers.items() if len(v) > 2 and bool(np.mean(np.diff(v) == 1.0) > COUNTING)]
+    of_sensor = {i: w for i, w in words.items() if w and not set(w) & TABLE_WORDS}
+    named = [i for i, w in of_sensor.items() if w[0] in TIME_FIRST or set(w) & TIME_WORDS]
+    of_arrays = [i for i, v in numbers.items() if columns.log.arrays and _never_falls(v)]
+    first = [i for i in of_arrays if columns.log.names[i].partition(" [")[0].endswith("[0]")]
+    unnamed = [i for i in sorted({*rising, *first}) if i not in counters and (not columns.log.named or i in of_sensor)]
+    alike = all(np.array_equal(numbers[i], numbers[unnamed[0]]) for i in unnamed[1:])  # of each array of a recording
+    unnamed = unnamed if not columns.log.named or (unnamed and alike) else []
+    candidates = [i for i in named if i in rising] or [i for i in named if _advances(numbers[i])] or unnamed
+    gap_free = [i for i in counters if i not in candidates and bool(np.all(np.diff(numbers[i]) == 1.0))]
+    steps = np.diff(numbers[candidates[0]]) if candidates else np.zeros(1)
+    if gap_free and steps.sum() > 0 and np.std(steps) > MAX_INTERVAL_SCATTER * abs(float(np.median(steps))):
+        columns.arrival, columns.counter = candidates[0], gap_free[0]
+    elif candidates:
+        columns.time = candidates[0]
+    elif counters:
+        columns.counter = counters[0]
+    index = columns.counter if columns.time is None else columns.time
+    falls = 0 if index is None else int(np.count_nonzero(np.diff(numbers[index]) < 0))
+    columns.steady = falls == 0  # a time that repeats is of samples in bursts
+    if index is not None and falls:
+        columns.remarks.append(
+            f"{columns.log.names[index]} does not increase at {falls} rows: several sessions (session: 1, "
+            "2 .. reads one of them), or a counter that overflows"
+        )
+
+
+def _never_falls(values: Values) -> bool:
+    """Return whether numbers rise, or repeat the one before, like the times of samples in bursts."""
+    return len(values) > MIN_ROWS and bool(np.all(np.diff(values) >= 0)) and bool(values[-1] > values[0])
+
+
+def _advances(values: Values) -> bool:
+    """Return whether numbers rise far more often than they fall, like times of several sessions."""
+    steps = np.diff(values)
+    return int(np.count_nonzero(steps > 0)) > FEWEST_RISES * int(np.count_nonzero(steps < 0))
+
+
+def _triad(words: dict[int, list[str]]) -> Triad | None:
+    """Return the columns of x, y and z among the columns of one sensor: the first of each axis."""
+    axes = {_axis_of(w): index for index, w in reversed(words.items())}
+    for names in ("xyz", "012", "123"):
+        if set(names) <= axes.keys():
+            x, y, z = (axes[n] for n in names)
+            return x, y, z
+    return None
+
+
+def _remark_on_other_triads(columns: Columns, sensor: str, words: dict[int, list[str]]) -> None:
+    """Add a remark on other triads for the same sensor: a second sensor of the board, or filtered readings."""
+    groups: dict[tuple[str, ...], dict[int, list[str]]] = {}
+    for index, w in words.items():
+        at = len(w) - 1 - w[::-1].index(_axis_of(w))
+        groups.setdefault((*w[:at], *w[at + 1 :]), {})[index] = w
+    triads = [t for group in groups.values() if (t := _triad(group)) is not None]
+    if len(triads) > 1:
+        taken = ", ".join(columns.log.names[i] for i in columns.triads[sensor])
+        others = "; ".join(", ".join(columns.log.names[i] for i in t) for t in triads if t != columns.triads[sensor])
+        what = sensor if sensor != "?" else "sensor"
+        remark = f"{len(triads)} triads may be the {what}: taken {taken}; the others are {others}; choose"
+        columns.remarks.append(remark)
+
+
+def _sensor_of_file(log: UnknownLog, triad: Triad) -> str:
+    stem = Path(log.path).stem.lower()
+    if "gyr" in stem or "angular" in stem or "rotation" in stem:
+        return "gyroscope"
+    return "accelerometer" if "acc" in stem or _spread(log, triad, _offset(log, [triad])) < 0.5 else "gyroscope"
+
+
+def _offset(log: UnknownLog, triads: Sequence[Triad]) -> float:
+    """Return the offset of unsigned counts, about which the readings of one sensor lie; 0 for other numbers."""
+    readings = np.array([[log.numbers[i] for i in triad] for triad in triads])
+    medians, unsigned = np.median(readings, axis=2), whole(readings) and readings.min() >= 0.0
+    for offset in OFFSETS if unsigned and readings.max() < 2.0 * OFFSETS[0] else ():
+        if np.abs(medians - offset).max(axis=1).min() < NEAR_OFFSET * offset:
+            return offset
+    return 0.0
+
+
+def _spread(log: UnknownLog, triad: Triad, offset: float) -> float:
+    """Return the relative spread of the length of a vector minus its offset, which is small for gravity."""
+    norm = np.linalg.norm(np.column_stack([log.numbers[i] for i in triad]) - offset, axis=1)
+    low, middle, high = np.quantile(norm, [0.16, 0.5, 0.84])
+    return float((high - low) / max(middle, 1e-30))
+
+
+def _find_triads_without_names(columns: Columns) -> None:
+    """Find the triads of a log without names: the length of the accelerometer's vector varies least."""
+    log = columns.log
+    free = [i for i, v in log.numbers.items() if i not in columns.of_time() and np.ptp(v) > 0]
+    groups = list(zip(free[::3], free[1::3], free[2::3], strict=False))
+
+    def called(triad: Triad) -> str:
+        return f"columns {triad}" if not log.named else ", ".join(log.names[i] for i in triad)
+
+    if len(groups) == 1:
+        sensor = _sensor_of_file(log, groups[0])
+        columns.triads[sensor] = groups[0]
+        columns.remarks.append(f"no names: {called(groups[0])} are taken as the {sensor}'s x, y, z; check it")
+    elif groups:
+        offset = _offset(log, groups)
+        force = min(groups, key=lambda group: _spread(log, group, offset))
+        rate = next(group for group in groups if group != force)
+        columns.triads |= {"accelerometer": force, "gyroscope": rate}
+        columns.remarks.append(
+            f"no names: {called(force)} are taken as the accelerometer's x, y, z, because their length varies by only "
+            f"{_spread(log, force, offset):.1%}, and {called(rate)} as the gyroscope's; check it"
+        )
+
+
+@dataclass(frozen=True)
+class UnknownLog:
+    """The columns of an unknown text log, or of a topic of a message log."""
+
+    path: str
+    csv: dict[str, Any]  # the section ``csv`` of a profile, without columns
+    keys: list[str | int]  # of each column in a profile: name, index, or path of a field
+    names: list[str]  # of the columns; for a field, with the unit that the file states
+    numbers: dict[int, Values]  # columns with only finite numbers
+    evidence: dict[str, str] = field(default_factory=dict)  # by key of ``csv``
+    remarks: list[str] = field(default_factory=list)
+    texts: dict[int, tuple[str, ...]] = field(default_factory=dict)  # the other columns
+    topic: str | None = None
+    arrays: bool = False  # the columns are those of arrays, acc[0], whose names need not say what they hold
+
+    @property
+    def named(self) -> bool:
+        """Whether the columns have names."""
+        return self.csv["header"] is not False
+
+
+def find_layout(data: bytes, path: str) -> UnknownLog:
+    """Split a text into columns; raises ``IngestError`` if it contains no table of numbers."""
+    lines = data.decode("utf-8", "replace").splitlines()
+    tried = [_try(lines[:LINES_TRIED], separator, decimal) for separator in SEPARATORS for decimal in NUMBER]
+    width, start, separator, decimal = max(tried, key=lambda t: (t[0], -t[1]))
+    names, skip, comment = _names(lines, start, separator)
+    parsed = lines[start : start + MAX_PARSED_ROWS]
+    rows = [cells for cells in _cells(parsed, separator) if len(cells) == len(names)]
+    numbers = _numbers(rows, decimal)
+    if width < MIN_COLUMNS or len(rows) < MIN_ROWS or not numbers:
+        first = " / ".join(lines[:3])[:150]
+        raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, code="no_table")
+    stated = ((STATED_NUMBER.search(line), line.strip()) for line in lines[:start] if RATE_KEY.search(line))
+    rates = ((float(match.group(1)), line) for match, line in stated if match)
+    rate_hz, rate_line = next((rate for rate in rates if rate[0]), (None, ""))
+    named, odd = names != _numbered(len(names)), len(parsed) - len(rows)
+    csv_section = {
+        "delimiter": "whitespace" if separator == " " else separator,
+        "decimal": decimal,
+        "header": COMMENTED if named and comment is not None else named,
+        "skip_lines": 0 if comment is not None else skip,
+        "comment": comment,
+        "rate_hz": rate_hz,
+    }
+    evidence = {"rate_hz": f"the file states {rate_line!r}"} if rate_hz is not None else {}
+    texts = {i: cells for i, cells in enumerate(zip(*rows, strict=True)) if i not in numbers}
+    remarks = [f"{odd} rows have another number of fields than the others"] if odd else []
+    return UnknownLog(
+        path, csv_section, [*(names if named else range(len(names)))], names, numbers, evidence, remarks, texts
+    )
+
+
+def _cells(lines: Sequence[str], separator: str) -> list[list[str]]:
+    if separator == " ":
+        return [line.split() for line in lines]
+    return list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
+
+
+def _numbered(count: int) -> list[str]:
+    return [f"column {i}" for i in range(count)]
+
+
+def _try(lines: list[str], separator: str, decimal: str) -> tuple[int, int, str, str]:
+    """Return the number of columns of numbers for a separator and decimal point, and the line where they begin."""
+    if not lines or (decimal == "," and (separator == "," or not any("," in line for line in lines))):
+        return 0, 0, separator, decimal
+    rows = _cells(lines, separator)
+    counts = [sum(bool(NUMBER[decimal].fullmatch(c.strip())) for c in cells) for cells in rows]
+    widths = [len(cells) for cells in rows]
+    width, usual = (int(np.median(x[len(x) // 2 :])) for x in (counts, widths))
+    start = next((i for i, (c, w) in enumerate(zip(counts, widths, strict=True)) if c >= width and w == usual), 0)
+    return width, start, separator, decimal
+
+
+def _names(lines: list[str], start: int, separator: str) -> tuple[list[str], int, str | None]:
+    """Return the names of the columns, the number of lines before them, and the start of comments."""
+    width = len(_cells([lines[start]], separator)[0]) if lines else 0
+    comment = "#" if start and lines[start - 1].lstrip().startswith("#") else None
+    above = _cells([lines[start - 1].lstrip().lstrip("#")], separator) if start else []
+    if above and len(above[0]) == width and not any(NUMBER["."].fullmatch(c.strip()) for c in above[0]):
+        return [c.strip() for c in above[0]], start - 1, comment
+    return _numbered(width), start, comment
+
+
+def _numbers(rows: list[list[str]], decimal: str) -> dict[int, Values]:
+    """Return the columns that contain only finite numbers, by index."""
+    columns = {}
+    for index, cells in enumerate(zip(*rows, strict=True)):
+        try:
+            column = np.array([c.replace(",", ".") for c in cells] if decimal == "," else cells, np.float64)
+        except ValueError:
+            continue
+        if np.isfinite(column).all():
+            columns[index] = column
+    return columns

@@ -1,0 +1,72 @@
+"""The errors of files and settings that users see.
+
+The message states what is wrong, where, what was expected and what to do.
+"""
+
+from __future__ import annotations
+
+UNKNOWN_LAYOUT = ("missing_column", "no_header", "missing_topic")  # codes of logs that a profile does not describe
+
+
+class UserError(Exception):
+    """A user error: ``message``, and ``file`` as ``path`` or ``path:line``."""
+
+    code: str = "error"
+
+    def __init__(self, message: str, file: str | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.file = file
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.message}" if self.file else self.message
+
+
+class InputError(UserError):
+    """A recording or another input file cannot be used."""
+
+    code = "bad_input"
+
+
+class IngestError(InputError):
+    """A recording cannot be used.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and where, with the facts.
+    code : str
+        A code of ``docs/bad_inputs.md``: ``not_a_number``, ``wrong_sense`` ...
+    offset : int, optional
+        Byte of the file at which the error was found.
+    hint : str
+        What the user can do.
+
+    Attributes
+    ----------
+    fact : str
+        The message without byte and hint.
+    sessions : int
+        Number of parts of a log whose logger was restarted.
+    """
+
+    sessions: int = 0
+
+    def __init__(
+        self, message: str, file: str | None = None, *, code: str = "damaged", offset: int | None = None, hint: str = ""
+    ) -> None:
+        place = "" if offset is None else f" (byte {offset})"
+        super().__init__(f"{message}{place}" + (f"; {hint}" if hint else ""), file)
+        self.code, self.fact = code, message
+
+
+class MissingInputError(InputError):
+    """A file that the procedure needs does not exist."""
+
+    code = "missing_file"
+
+
+class ConfigurationError(UserError):
+    """A setting is unknown, of the wrong type or out of its range."""
+
+    code = "bad_configuration"
