@@ -49,11 +49,14 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401  (a class or a function)
 
     They need numpy or pydantic, which a program that only looks up files does not load.
     """
-    from imu_logs import log, profile  # noqa: PLC0415  (see above)
+    if name in ("Log", "Note"):
+        from imu_logs.log import Log, Note  # noqa: PLC0415  (see above)
 
-    homes = {"Log": log, "Note": log, "Profile": profile, "load_profile": profile}
-    if name in homes:
-        return getattr(homes[name], name)
+        return Log if name == "Log" else Note
+    if name in ("Profile", "load_profile"):
+        from imu_logs.profile import Profile, load_profile  # noqa: PLC0415  (likewise)
+
+        return Profile if name == "Profile" else load_profile
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
@@ -88,14 +91,11 @@ def read(
     Raises
     ------
     IngestError
-        If the log is damaged, contradicts the profile, or has impossible times.
+        If the log does not exist, is damaged, contradicts the profile, or has impossible times.
     ConfigurationError
         If the profile is not valid.
     """
     files = [Path(p) for p in ([paths] if isinstance(paths, str | os.PathLike) else paths)]
-    for file in files:
-        if not os.path.lexists(file):
-            raise MissingInputError("there is no such log", str(file))
     from imu_logs.profile import Profile, checks_of, csv_formats, load_profile  # noqa: PLC0415  (pydantic)
 
     known = profile if isinstance(profile, Profile) else load_profile(profile or CANONICAL_CSV)

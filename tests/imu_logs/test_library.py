@@ -93,5 +93,5 @@ def test_a_proposal_reads_the_log_where_names_state_the_units(tmp_path: Path) ->
 
 
 def test_a_log_that_does_not_exist_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(imu_logs.MissingInputError):
+    with pytest.raises(imu_logs.IngestError, match="No such file"):
         imu_logs.read(tmp_path / "none.csv")
