@@ -21,7 +21,7 @@ from pipeline.errors import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records.recording import Values
+    from imu_logs.log import Values
 
 KINDS = "subtract, matrix, two_sided"
 
