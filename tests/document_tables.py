@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / name) for name in ("imu_logs", "preprocessing", "profile_detection", "."))]
+sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / name) for name in ("imu_logs", "preprocessing", "."))]
 
 import bad_logs  # noqa: E402
 import bad_units  # noqa: E402
