@@ -162,3 +162,8 @@ def flush_file_system(folder: Path) -> None:
             raise OSError(number, os.strerror(number), str(folder))
     finally:
         os.close(descriptor)
+
+
+def canonical_json(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)
+    """Return JSON with sorted keys and no blanks, for digests."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()

@@ -442,6 +442,13 @@ class Settings(Unit):
     user_effects: UserEffectFiles | None = None
     stated: Stated = Stated()
 
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """The configuration of the unit as dictionaries."""
+        sections = {name: getattr(self, name).model_dump() for name in Unit.model_fields}
+        of_user = {"user_effects": self.user_effects.model_dump()} if self.user_effects else {}
+        return {"unit": self.unit, **sections, **of_user}
+
     def only(self, sections: Iterable[str]) -> dict[str, Any]:
         """Return sections as JSON values; ``effects.gyroscope`` is the part of one sensor."""
         found: dict[str, Any] = {}

@@ -14,7 +14,6 @@ import yaml
 from pipeline.commands import parser_of
 from pipeline.config.campaign import find_campaign, read_layers
 from pipeline.config.options import GROUPS, Problem, default_option, nearest, parse, read_option
-from pipeline.config.stage_settings import configuration
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
@@ -52,7 +51,7 @@ def main(argv: Sequence[str]) -> int:
     except Problem as problem:
         raise ConfigurationError(f"unit {unit}: {problem}", str(directory / "units.csv")) from None
     print(f"# Unit {unit} of campaign {directory}")
-    print("\n".join([*_overrides(layers), *_tree(configuration(config), _origins(composer, layers), composer)]))
+    print("\n".join([*_overrides(layers), *_tree(config.configuration, _origins(composer, layers), composer)]))
     return 0
 
 

@@ -22,6 +22,7 @@ others is a curve.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import unicodedata
@@ -35,10 +36,9 @@ from pydantic import ValidationError
 from pipeline.config.compose import Composer
 from pipeline.config.layers import as_list, load_layers
 from pipeline.config.options import GROUPS, RUN_SETTINGS, Problem, mapping_of, nearest, parse
-from pipeline.config.stage_settings import config_sha256
 from pipeline.config.user_effects import GIVEN, PYTHON
 from pipeline.errors import ConfigurationError, first
-from pipeline.files import CONFIGS, SHIPPED
+from pipeline.files import CONFIGS, SHIPPED, canonical_json
 from pipeline.history import SENSORS
 from pipeline.settings import OF_BENCH, RunSettings
 
@@ -66,8 +66,9 @@ class UnitRow:
 
     @cached_property
     def config_sha256(self) -> str:
-        """Digest of the configuration, which results state."""
-        return config_sha256(self.config)
+        """Digest of the configuration without the section ``certificate``, which results state."""
+        content = {name: section for name, section in self.config.configuration.items() if name != "certificate"}
+        return hashlib.sha256(canonical_json(content)).hexdigest()
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.config.user_effects import effects_for
-from pipeline.files import CONFIGS
+from pipeline.files import CONFIGS, canonical_json
 from pipeline.history import SENSORS, digest
 from pipeline.io.files import recording_files
 from pipeline.settings import Board, Settings, Stated, Unit
@@ -35,19 +35,6 @@ IMPORT = re.compile(
     r"^[ \t]*(?:from (pipeline[\w.]*|jinja2) import (\([^)]*\)|.*)|import (pipeline[\w.]*))", re.MULTILINE
 )
 OF_STAGES = {**{name: step.settings for name, step in STEPS.items()}, "prior": STEPS["validate"].settings}
-
-
-def config_sha256(settings: Settings) -> str:
-    """Return the SHA-256 of the configuration of a unit as canonical JSON, without the section ``certificate``."""
-    content = {name: section for name, section in configuration(settings).items() if name != "certificate"}
-    return hashlib.sha256(_canonical(content)).hexdigest()
-
-
-def configuration(settings: Settings) -> dict[str, Any]:
-    """Return the whole configuration of a unit as dictionaries."""
-    sections = {name: getattr(settings, name).model_dump() for name in Unit.model_fields}
-    of_user = {"user_effects": settings.user_effects.model_dump()} if settings.user_effects else {}
-    return {"unit": settings.unit, **sections, **of_user}
 
 
 def sections_of(stage: str, sensor: str, settings: Settings) -> tuple[str, ...]:
@@ -82,7 +69,7 @@ def settings_in_memory(unit: UnitRow, stage: str, sensor: str = "", run: Mapping
 
 def as_job_reads(value: Any) -> Any:  # noqa: ANN401  (any JSON value)
     """Return a value as a job reads it from its settings: keys, and with them terms of effects, are sorted."""
-    return json.loads(_canonical(value))
+    return json.loads(canonical_json(value))
 
 
 class SettingsFile(NamedTuple):
@@ -139,7 +126,7 @@ def settings_of_jobs(
 
 
 def _file(output: str, content: dict[str, Any], again: int) -> SettingsFile:
-    text = _canonical(content | ({"again": again} if again else {}))
+    text = canonical_json(content | ({"again": again} if again else {}))
     return SettingsFile(f"{output.replace('/', '-')}-{hashlib.sha256(text).hexdigest()[:16]}.json", text)
 
 
@@ -216,10 +203,6 @@ def _sections(campaign: Campaign) -> tuple[dict[str, dict[str, str]], dict[str, 
                 values.setdefault(known[id(content)], value)
             digests[name][section] = known[id(content)]
     return digests, values
-
-
-def _canonical(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 @cache

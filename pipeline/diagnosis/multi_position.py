@@ -34,9 +34,10 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
 from pipeline.estimation.least_squares import ScaledColumns, cholesky
+from pipeline.estimation.multi_position.effects import model_of
 from pipeline.estimation.multi_position.fit import FitByHand, fit
 from pipeline.estimation.multi_position.model import MIN_NEW_NORM_SHARE, NoiseHypothesis, project_out
-from pipeline.estimation.multi_position.result import calibration_of, model_of
+from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import SelectionByHand, posterior
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import is_given
@@ -172,7 +173,7 @@ def require_model(
     settings: Settings,
     accelerometer: SensorCalibration | None = None,
 ) -> Model:
-    """Return the model of rests and moves; see ``pipeline.estimation.multi_position.result.model_of``.
+    """Return the model of rests and moves; see ``pipeline.estimation.multi_position.effects.model_of``.
 
     Raises ``NotObservableError`` if there are no rests, or if they do not determine bias and matrix.
     """

@@ -37,7 +37,7 @@ def fit(
         return before
     noise = recordings.noises[sensor]
     if by_hand:
-        from pipeline.estimation.multi_position.result import fit_effects_by_rests  # noqa: PLC0415  (recordings by hand alone)
+        from pipeline.estimation.multi_position.effects import fit_effects_by_rests  # noqa: PLC0415  (recordings by hand alone)
 
         return fit_effects_by_rests(before, recordings, settings)
     names = configured_effects(sensor, settings, recordings.filtered)

@@ -34,13 +34,13 @@ from pipeline.preprocessing.bench import (
     stated_bench,
     usual_up,
 )
-from pipeline.preprocessing.seats import refined_zeros, seat_notes
+from pipeline.preprocessing.seats import TurnRecording, refined_zeros, seat_notes
 from pipeline.records import AXES, Note, level_in_body
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.preprocessing.bench import TurnFit, TurnMounting
+    from pipeline.preprocessing.bench import TurnMounting
     from pipeline.records import Recording, Values
     from pipeline.settings import Procedure, Sensor, Settings, Table
 
@@ -49,23 +49,6 @@ TIME_OFFSET_S = 0.04  # largest plausible one where the sensor's config states n
 AGREES_G = 0.7  # of 1 g, within 45 deg of the axis
 BIAS_DEG = 6.0  # error of the zero by a bias of 0.1 g where all rests are at one angle
 UNLIKE = 0.5  # gain of the stated axis over the largest one, below which the unit turned about another axis
-
-
-@dataclass(frozen=True)
-class TurnRecording:
-    """A turn recording, its stated mounting and the one by gravity."""
-
-    recording: Recording
-    stated: TurnMounting
-    fit: TurnFit
-    found: TurnMounting | None  # None where gravity does not determine it
-    configurable: bool  # whether the procedure has an entry of the recording's name
-    tolerance_deg: float  # of the zero
-
-    @property
-    def name(self) -> str:
-        """Name of the recording."""
-        return self.recording.name
 
 
 @dataclass(frozen=True)

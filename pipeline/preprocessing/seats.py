@@ -36,9 +36,8 @@ from pipeline.records import AFTER_BASE, AXES, BASE_COUNT, MATRIX_NAMES, Note, m
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.preprocessing.bench import FittedGravity, TurnMounting
-    from pipeline.preprocessing.mounting import TurnRecording
-    from pipeline.records import Values
+    from pipeline.preprocessing.bench import FittedGravity, TurnFit, TurnMounting
+    from pipeline.records import Recording, Values
     from pipeline.settings import Sensor, Table
 
 # Smaller seats are left to the diagnosis: hidden table effects of the blind study (tilt 0.26 deg, leans 0.13 deg) reach
@@ -57,6 +56,23 @@ QUARTER_TURNS_DEG = np.array([0.0, 90.0, 180.0, 270.0])
 TABLE_EFFECTS = ("table_tilt", "table_axis_nonorthogonality")
 # Largest plausible tilt (deg), lean (deg) and time offset (s) where the sensor's config states none.
 BENCH_LIMITS = {"table_tilt": 1.0, "table_axis_nonorthogonality": 1.0, "time_offset": 0.04}
+
+
+@dataclass(frozen=True)
+class TurnRecording:
+    """A turn recording, its stated mounting and the one by gravity."""
+
+    recording: Recording
+    stated: TurnMounting
+    fit: TurnFit
+    found: TurnMounting | None  # None where gravity does not determine it
+    configurable: bool  # whether the procedure has an entry of the recording's name
+    tolerance_deg: float  # of the zero
+
+    @property
+    def name(self) -> str:
+        """Name of the recording."""
+        return self.recording.name
 
 
 @dataclass(frozen=True)

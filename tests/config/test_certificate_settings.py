@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.config import load_campaign
-from pipeline.config.stage_settings import config_sha256
+from pipeline.config.campaign import UnitRow
 from pipeline.errors import ConfigurationError
 
 
@@ -21,8 +21,15 @@ def test_a_unit_takes_the_laboratory_of_its_row_and_keeps_its_hash(tmp_path: Pat
     mine, blank = (loaded.units[u].config for u in ("U1", "U2"))
     assert (mine.certificate.laboratory.name, mine.certificate.issued) == ("Mine", "2026-03-01")
     assert blank.certificate.laboratory.name is None
-    assert config_sha256(mine) == config_sha256(mine.replaced(certificate=blank.certificate))
-    assert config_sha256(mine) != config_sha256(mine.replaced(filter=blank.filter.replaced(order=3)))
+    digests = [
+        UnitRow("U1", {}, config).config_sha256
+        for config in (
+            mine,
+            mine.replaced(certificate=blank.certificate),
+            mine.replaced(filter=blank.filter.replaced(order=3)),
+        )
+    ]
+    assert digests[0] == digests[1] != digests[2]
 
 
 def test_a_date_that_is_none_is_refused_by_name(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pipeline.__main__ import main
 from pipeline.config import Campaign, load_campaign
 from pipeline.config.options import parse
-from pipeline.config.stage_settings import configuration, in_common, settings_in_memory
+from pipeline.config.stage_settings import in_common, settings_in_memory
 from pipeline.errors import ConfigurationError
 from pipeline.stages.batch import merge_common
 
@@ -133,7 +133,7 @@ def test_config_prints_the_resolved_configuration_and_the_origin_of_each_value(
 ) -> None:
     text, origins = printed(capsys, "U4", "sensor.gyroscope.bias=3", "--campaign", str(fleet))
     resolved = load(fleet, overrides="sensor.gyroscope.bias=3").units["U4"].config
-    assert yaml.safe_load(text) == configuration(resolved)
+    assert yaml.safe_load(text) == resolved.configuration
     assert {
         key: origins[key]
         for key in (

@@ -15,9 +15,10 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.least_squares import ScaledColumns
+from pipeline.estimation.multi_position.effects import accelerometer_of
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly
-from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, MOVED, accelerometer_of, model_of
+from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, MOVED, model_of
 from pipeline.estimation.multi_position.model import MIN_NEW_NORM_SHARE, State, prior_hypotheses
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage

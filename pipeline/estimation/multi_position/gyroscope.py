@@ -31,7 +31,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.engine import draw_normal
 from pipeline.estimation.least_squares import cholesky
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
@@ -52,7 +51,6 @@ from pipeline.estimation.multi_position.moves import (
     tangents,
     to_the_end,
 )
-from pipeline.estimation.stages import given_calibration, is_given
 from pipeline.model.kinematics import skew
 from pipeline.records import BASE, BASE_COUNT, BIAS, MATRIX
 
@@ -62,8 +60,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.rest_means import Rests
-    from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, UnitRecordings, Values
-    from pipeline.settings import Procedure, Settings
+    from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
+    from pipeline.settings import Procedure
 
 MIN_MOVES = 6  # two equations each, for the nine of the matrix
 RATE_ITERATIONS = 6  # of effects that depend on the rate
@@ -308,23 +306,6 @@ class GyroscopeModel:
             if np.abs(rate - before).max() < SETTLED_DPS:
                 break
         return motion, v, A
-
-
-def accelerometer_of(recordings: UnitRecordings, settings: Settings) -> SensorCalibration:
-    """Return the given calibration of the accelerometer (``method.given``), else calibrate it.
-
-    Raises ``CannotCalibrateError`` if that fails.
-    """
-    from pipeline.estimation.accelerometer import nonlinear_least_squares  # noqa: PLC0415  (needs this package)
-
-    try:
-        if is_given("accelerometer", settings.method):
-            return given_calibration("accelerometer", settings.method)
-        return nonlinear_least_squares.fit(recordings, None, settings)
-    except (NotObservableError, CannotCalibrateError) as lack:
-        raise CannotCalibrateError(
-            f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"
-        ) from lack
 
 
 def model_of(

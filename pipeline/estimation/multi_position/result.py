@@ -1,4 +1,4 @@
-"""Convert a fit to rests and moves to a calibration with its uncertainty budget; run the stage ``effects`` of a fit.
+"""Convert a fit to rests and moves to a calibration with its uncertainty budget.
 
 The Monte Carlo run of the budget is to second order of the model. The errors of the equations are drawn under every
 hypothesis of the noise by its weight, and solved with the weights of that hypothesis, because the fit averages over the
@@ -16,18 +16,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.errors import NotObservableError
 from pipeline.estimation.at_limits import changes_by_hand, changes_through_gravity, gain_of
-from pipeline.estimation.candidates import AUTO, limits_of
 from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import quadratic_results, with_trials
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
-from pipeline.estimation.multi_position.fit import FitByHand, fit, plausible, require_observable
-from pipeline.estimation.multi_position.model import Model, State, prior_hypotheses, selection_hypotheses, stepped
-from pipeline.estimation.multi_position.selection import SelectionByHand, fit_configured, refusal
-from pipeline.estimation.noise import wander_prior, with_noises
+from pipeline.estimation.multi_position.fit import FitByHand, fit
+from pipeline.estimation.multi_position.model import Model, State, prior_hypotheses, stepped
+from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.stages import is_given, unknown_uncertainty
 from pipeline.estimation.table_errors import TIME_BASE
@@ -41,13 +38,12 @@ from pipeline.estimation.uncertainty_budget import (
     limit_contribution,
     scatter_contribution,
 )
-from pipeline.model.effects import effect
 from pipeline.records import Contribution, Recording, SensorCalibration, StageResult, Values, base_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Noise, UnitRecordings
+    from pipeline.records import UnitRecordings
     from pipeline.settings import Procedure, Settings
 
 
@@ -62,63 +58,6 @@ NOT_INCLUDED = {
     "temperature": TEMPERATURE,
 }
 NAME = "faces"
-
-
-def model_of(
-    recordings: Sequence[Recording],
-    calibration: SensorCalibration,
-    noise: Noise | None,
-    settings: Settings,
-    other: SensorCalibration | None = None,
-) -> Model | None:
-    """Return the model of the sensor of a calibration, or None if its recordings have no rest.
-
-    ``calibration``: of the sensor's method. ``other``: of the accelerometer, where the sensor is the gyroscope; by
-    default ``accelerometer_of``.
-    """
-    if calibration.sensor == "accelerometer":
-        return accelerometer.model_of(recordings, calibration, noise, settings)
-    if other is None:
-        other = gyroscope.accelerometer_of(with_noises(recordings, settings.sensor, ("accelerometer",)), settings)
-    return gyroscope.model_of(recordings, calibration, noise, settings.procedure, other)
-
-
-def fit_effects_by_rests(
-    before: SensorCalibration, recordings: UnitRecordings, settings: Settings
-) -> SensorCalibration:
-    """Fit the effects of ``settings.effects`` together with bias and matrix to rests and moves.
-
-    ``before``: of the sensor's method; returned unchanged where there is no effect to add. Raises
-    ``NotObservableError`` if rests and moves do not determine an effect; ``ConfigurationError`` if an effect is unknown
-    or not of this sensor.
-    """
-    sensor = before.sensor
-    wanted, data_sheet = settings.effects.of(sensor), settings.sensor.of(sensor)
-    noise, other = recordings.noises[sensor], None
-    if sensor == "gyroscope":
-        other = gyroscope.accelerometer_of(recordings, settings)
-    model = model_of(recordings.filtered, before, noise, settings, other)
-    if model is None:
-        return before
-    names = SelectionByHand(model, before, [], noise, data_sheet).names if wanted == AUTO else list(wanted)
-    if not names:
-        return before
-    for name in names:
-        reason = refusal(effect(name), sensor, model.rests) if sensor in effect(name).sensors else ""
-        if reason:
-            raise NotObservableError(f"{name} cannot be fitted by hand: {reason}; take it out of effects.{sensor}")
-    hypotheses = selection_hypotheses(noise, model.kinds)
-    limits = limits_of(sensor, data_sheet)
-    fitted = fit_configured(model, before, names, hypotheses)
-    if plausible(model, fitted, limits):
-        fitted = fit_configured(model, before, names, hypotheses, limits)
-    if len(fitted.residual) <= fitted.rank:
-        raise NotObservableError(
-            f"{len(model.rests.time)} rests of the {sensor} are too few for {', '.join(names)} in addition to bias and "
-            f"matrix: record at least {fitted.rank + 10} rests in as many orientations"
-        )
-    require_observable(model, fitted, limits)
-    return calibration_of(model, fitted, before, settings, other)
 
 
 def calibration_of(

@@ -1,0 +1,96 @@
+"""Model of the rests and moves of either sensor, and the stage ``effects`` of a fit by hand."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.candidates import AUTO, limits_of
+from pipeline.estimation.multi_position import accelerometer, gyroscope
+from pipeline.estimation.multi_position.fit import plausible, require_observable
+from pipeline.estimation.multi_position.model import selection_hypotheses
+from pipeline.estimation.multi_position.result import calibration_of
+from pipeline.estimation.multi_position.selection import SelectionByHand, fit_configured, refusal
+from pipeline.estimation.noise import with_noises
+from pipeline.estimation.stages import given_calibration, is_given
+from pipeline.model.effects import effect
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.estimation.multi_position.model import Model
+    from pipeline.records import Noise, Recording, SensorCalibration, UnitRecordings
+    from pipeline.settings import Settings
+
+
+def accelerometer_of(recordings: UnitRecordings, settings: Settings) -> SensorCalibration:
+    """Return the given calibration of the accelerometer (``method.given``), else calibrate it.
+
+    Raises ``CannotCalibrateError`` if that fails.
+    """
+    try:
+        if is_given("accelerometer", settings.method):
+            return given_calibration("accelerometer", settings.method)
+        return nonlinear_least_squares.fit(recordings, None, settings)
+    except (NotObservableError, CannotCalibrateError) as lack:
+        raise CannotCalibrateError(
+            f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"
+        ) from lack
+
+
+def model_of(
+    recordings: Sequence[Recording],
+    calibration: SensorCalibration,
+    noise: Noise | None,
+    settings: Settings,
+    other: SensorCalibration | None = None,
+) -> Model | None:
+    """Return the model of the sensor of a calibration, or None if its recordings have no rest.
+
+    ``calibration``: of the sensor's method. ``other``: of the accelerometer, where the sensor is the gyroscope; by
+    default ``accelerometer_of``.
+    """
+    if calibration.sensor == "accelerometer":
+        return accelerometer.model_of(recordings, calibration, noise, settings)
+    if other is None:
+        other = accelerometer_of(with_noises(recordings, settings.sensor, ("accelerometer",)), settings)
+    return gyroscope.model_of(recordings, calibration, noise, settings.procedure, other)
+
+
+def fit_effects_by_rests(
+    before: SensorCalibration, recordings: UnitRecordings, settings: Settings
+) -> SensorCalibration:
+    """Fit the effects of ``settings.effects`` together with bias and matrix to rests and moves.
+
+    ``before``: of the sensor's method; returned unchanged where there is no effect to add. Raises
+    ``NotObservableError`` if rests and moves do not determine an effect; ``ConfigurationError`` if an effect is unknown
+    or not of this sensor.
+    """
+    sensor = before.sensor
+    wanted, data_sheet = settings.effects.of(sensor), settings.sensor.of(sensor)
+    noise, other = recordings.noises[sensor], None
+    if sensor == "gyroscope":
+        other = accelerometer_of(recordings, settings)
+    model = model_of(recordings.filtered, before, noise, settings, other)
+    if model is None:
+        return before
+    names = SelectionByHand(model, before, [], noise, data_sheet).names if wanted == AUTO else list(wanted)
+    if not names:
+        return before
+    for name in names:
+        reason = refusal(effect(name), sensor, model.rests) if sensor in effect(name).sensors else ""
+        if reason:
+            raise NotObservableError(f"{name} cannot be fitted by hand: {reason}; take it out of effects.{sensor}")
+    hypotheses = selection_hypotheses(noise, model.kinds)
+    limits = limits_of(sensor, data_sheet)
+    fitted = fit_configured(model, before, names, hypotheses)
+    if plausible(model, fitted, limits):
+        fitted = fit_configured(model, before, names, hypotheses, limits)
+    if len(fitted.residual) <= fitted.rank:
+        raise NotObservableError(
+            f"{len(model.rests.time)} rests of the {sensor} are too few for {', '.join(names)} in addition to bias and "
+            f"matrix: record at least {fitted.rank + 10} rests in as many orientations"
+        )
+    require_observable(model, fitted, limits)
+    return calibration_of(model, fitted, before, settings, other)
