@@ -16,7 +16,7 @@ from pipeline.exports.conversion import explain_board, explain_calibration
 from pipeline.exports.reading import counts_of, read_any
 from pipeline.files import read_json
 from pipeline.history import read_history
-from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, left_out, sentences
+from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 from pipeline.outcome import (
     DIAGNOSIS_FAILED,
     NOT_CONVERGED,
@@ -131,6 +131,7 @@ def explain(folder: Path, diagnoses: dict[str, JSON], failures: dict[str, JSON])
                     for s in SENSORS
                     for source, reason in beyond_uncertainty(calibration.get(s))
                 ),
+                *(f"{s.capitalize()}: {words}." for s in SENSORS if (words := frame_words(calibration.get(s)))),
                 *(
                     f"{s.capitalize()}: {reason}."
                     for s in SENSORS

@@ -277,6 +277,8 @@ NAMED_PARAMETERS = 5  # parameters beyond the limits that a line names
 RANGE_RATIOS = [2.0**n for n in range(-6, 7) if n]  # ratios of the ranges of one sensor: neighbours differ by two
 OF_BIAS = "an offset of raw counts that is not subtracted, another column, or a damaged axis"
 OF_CROSS_AXIS = "another column or axis map, or a unit that moved on the table between recordings"
+OF_FRAME = "the direction of the case"
+NO_FRAME = "how it lies in the body frame of turn axes, faces and zeros is not stated (table.seat_deg, procedure.faces)"
 OF_EFFECT = "another effect that looks alike, or an error of the table, its log or the time stamps"
 
 Entry = dict[str, Any]
@@ -416,7 +418,16 @@ def beyond_uncertainty(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
             if size > max(u or 0.0 for u in (U if key == "bias" else np.diag(U))):
                 of = f"{size:.2g} {part['unit']} of bias" if key == "bias" else f"{100.0 * size:.2g} % of the matrix"
                 found.append((f"{entry['source']}, up to {of}", entry["reason"].partition("; up to ")[0]))
+    if part.get("frame_deg", ()) is None:
+        found.append((OF_FRAME, NO_FRAME))
     return found + left_open
+
+
+def frame_words(part: Mapping[str, Any] | None) -> str:
+    """Return how well the body frame of a sensor is known against the case; empty where nothing is stated."""
+    frame = (part or {}).get("frame_deg")
+    sizes = frame and ", ".join(f"{u:.2g}" for u in frame)
+    return f"The body frame is known against the case to {sizes} deg about x, y, z (95 %)" if sizes else ""
 
 
 def not_determined(part: Mapping[str, Any]) -> str:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
-from pipeline.model.calibration_file import beyond_uncertainty
+from pipeline.model.calibration_file import beyond_uncertainty, frame_words
 from pipeline.outcome import run_command
 from pipeline.records import SENSORS
 from pipeline.report.held_out_section import first_and_last_step
@@ -167,6 +167,7 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: Settings, 
             "laboratory": stated.environment,
         },
         "results": _quantities(part),
+        "frame": frame_words(part) or None,
         "notInUncertainty": [f"{source}: {reason}" for source, reason in beyond_uncertainty(part)],
         "beyondLimits": part.get("beyond_limits") or [],
         "uncertaintyBudget": part.get("uncertainty_budget"),

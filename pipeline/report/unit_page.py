@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.files import json_text
-from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, left_out, sentences
+from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 from pipeline.outcome import as_overrides, commands_of, found_mountings, place, run_command
 from pipeline.records import MATRIX, SENSOR_UNITS, SENSORS, Recording, Values
 from pipeline.report.chart import Figure, Layer, LineMark, Panel, chart
@@ -170,6 +170,7 @@ def _sensor(
         "limits": limits,
         "implausible": sentences(sensor, part),
         "beyond": beyond_uncertainty(part),
+        "frame": frame_words(part),
         "kind": "warn" if not held_out.get("held_out", True) else "" if (far or likely) and kind == "good" else kind,
         "of_rests": table.motion == "none" and not logged,
         "far": far,

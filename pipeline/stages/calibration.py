@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineError
 from pipeline.estimation.chip_fit import Chip
 from pipeline.estimation.chips import chip_document
+from pipeline.estimation.frame import frame_uncertainty
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.io.axis_maps import axis_maps
 from pipeline.io.quality_flags import GAP
@@ -78,6 +79,7 @@ def calibration_document(  # noqa: PLR0917  (what a calibration is composed of)
         document[sensor] = None
         if sensor not in reasons and isinstance(fit, SensorCalibration):
             part = {k: v for k, v in fit.to_json().items() if k != "at_limits"} | with_open(sensor, fit, hidden)
+            part["frame_deg"] = frame_uncertainty(fit, checked, settings)
             document[sensor] = judged(sensor, part, settings.sensor.of(sensor))
     return document
 
