@@ -11,40 +11,34 @@ import json
 import math
 import re
 import shlex
+from collections import Counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.errors import first
 from pipeline.files import INSTALLED, read_json, text_of_cell
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
-from pipeline.verdicts import WITH_THEM, Verdict
+from pipeline.verdicts import FAILED, KINDS, READY, SETTING, WITH_THEM, Verdict, error_in_row, kinds_of, problems
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from pipeline.verdicts import Problem
+
     Ways = Sequence[Sequence[str]]
 
 JSON = dict[str, Any]
 UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
-DIAGNOSIS_FAILED = "diagnosis_failed"  # stands for a verdict in lists; in documents it is ``Verdict.NOT_ENOUGH_DATA``
 ZERO = re.compile(r"(?<=zero_deg=)-?[0-9.]+")
 ALIKE_DEG = 0.1  # gravity shows a zero to some hundredths of a degree (docs/mounting.md, What is checked)
 NAMED_PER_LINE = 5  # units that a line names, and lines of one kind
+NAMED_MISSING = 10  # units with a missing effect that the last lines name
 SMALLEST_CHANGE = 0.02  # relative change of an error that is reported
 PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes in YAML, also within brackets
 NOT_TEXT = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}  # words that YAML reads as another type
 EFFECTS = re.compile(r"effects\.(accelerometer|gyroscope)=\[(.*)\]")
 NOT_CONVERGED = "the fit did not converge: parameters and uncertainties are in doubt"
 RESULTS = "results"  # the default folder of results
-
-
-class Finding(NamedTuple):
-    """The verdict on one sensor of a unit."""
-
-    unit: str
-    sensor: str
-    verdict: str
-    selected: Sequence[str]
 
 
 class FoundMounting(NamedTuple):
@@ -101,29 +95,27 @@ def read_summary(results: Path) -> list[dict[str, str]]:
         return [{text_of_cell(key): text_of_cell(value or "") for key, value in row.items()} for row in rows]
 
 
-def findings_of(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """Return the verdict on each sensor in rows of ``summary.csv``, or that its diagnosis failed."""
-    found = []
-    for row in rows:
-        causes = (row.get("incomplete") or "").split("; ")
-        for sensor in [s for s in SENSORS if row.get(f"{s}_verdict")]:
-            failed = any(cause.startswith(("diagnose: ", f"diagnose/{sensor}: ")) for cause in causes)
-            selected = list(filter(None, (row[f"{sensor}_selected"] or "").split(";")))
-            found.append(
-                Finding(row["unit"], sensor, DIAGNOSIS_FAILED if failed else row[f"{sensor}_verdict"], selected)
-            )
-    return found
+def counts_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """Return the number of units by their most urgent kind of problem, of those that are ready, and that failed."""
+    counts = Counter(next(iter(kinds_of(row)), READY) for row in rows)
+    order = [READY, *(kind for kind in KINDS if kind not in (READY, FAILED)), FAILED]
+    return {kind: counts[kind] for kind in order if counts[kind] or kind in (READY, FAILED)}
 
 
-def verdict_groups(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
-    """Group the units by missing effect, or by verdict; units with ``nothing_missing`` are left out."""
-    groups: dict[tuple[int, str], list[str]] = {}
-    for unit, sensor, verdict, selected in findings:
-        missing = [f"{effect} missing" for effect in selected]
-        texts = missing if verdict == Verdict.MISSING_EFFECT else [verdict.replace("_", " ")]
-        for what in texts if verdict != Verdict.NOTHING_MISSING else []:
-            groups.setdefault((place(verdict), f"{sensor}, {what}"), []).append(unit)
-    return [(what, units) for (_, what), units in sorted(groups.items())]
+def counted(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the counts in words: ``10 units: 4 ready, 1 effect missing, 0 failed``."""
+    kinds = ", ".join(f"{count} {KINDS[kind].name}" for kind, count in counts_of(rows).items())
+    return f"{len(rows)} unit{'s' * (len(rows) != 1)}: {kinds}"
+
+
+def all_well(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the sentence for a campaign whose units are all ready; empty for another one."""
+    if not rows or any(map(kinds_of, rows)):
+        return ""
+    ratios = [ratio for row in rows for s in SENSORS if (ratio := error_in_row(row, s).ratio)]
+    error = f", and the error on held-out motion is at most {max(ratios):.3g} x noise" if ratios else ""
+    who = f"All {len(rows)} units are" if len(rows) > 1 else "The unit is"
+    return f"{who} ready: nothing that the recordings can show is missing{error}."
 
 
 def beyond_limits_groups(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
@@ -162,25 +154,42 @@ def commands_of(
     }
 
 
-def next_commands(
-    findings: Sequence[Finding], settings: Mapping[str, Any], results: str = RESULTS
-) -> list[tuple[str, str]]:
-    """Return the purpose and the text of each command with which the user can continue."""
-    missing: dict[str, list[str]] = {}
-    for unit, sensor, verdict, selected in findings:
-        if verdict == Verdict.MISSING_EFFECT:
-            missing.setdefault(unit, []).extend(f"{sensor}.{effect}" for effect in selected)
-    lines = []
-    if len(missing) == 1:
-        ((unit, effects),) = missing.items()
-        lines.append(("to add what is missing", add_command(settings, unit, effects, results)))
-    elif missing:
-        command = _command("add", settings, ["--missing"], results)
-        lines.append(("to add to each unit its missing effects", command))
-    if any(f.verdict != Verdict.NOTHING_MISSING for f in findings):
-        campaign = str(settings.get("campaign", "demo")).rstrip("/")
-        lines.append(("for the evidence", _command("explain", {"campaign": campaign}, [], results)))
-    return lines
+def command_of(problem: Problem, settings: Mapping[str, Any], results: str = RESULTS) -> str:
+    """Return the command with which the user can continue: it adds, runs again, or shows the evidence."""
+    units, overrides = problem.units, SETTING.findall(problem.step)
+    if problem.kind == Verdict.MISSING_EFFECT:
+        if len(units) == 1:
+            return add_command(settings, units[0], problem.effects, results)
+        names = {effect.partition(".")[2] for effect in problem.effects}
+        return _command("add", settings, ["--missing", *(names if len(names) == 1 else ())], results)
+    again = dict(settings) | ({"results": results} if results != RESULTS else {})
+    if problem.kind == FAILED:
+        return run_command(again)
+    if overrides and len(units) <= NAMED_PER_LINE:
+        given = settings.get("unit_overrides") or {}
+        of_units = {unit: [*given.get(unit, []), *overrides] for unit in sorted(units)}
+        return run_command(again | {"unit_overrides": {**given, **of_units}})
+    return explain_command(settings, [units[0]], results)
+
+
+def explain_command(settings: Mapping[str, Any], words: Sequence[str], results: str = RESULTS) -> str:
+    """Return the command that shows the evidence for some units, or with ``--all`` for every unit."""
+    campaign = str(settings.get("campaign", "demo")).rstrip("/")
+    return _command("explain", {"campaign": campaign}, words, results)
+
+
+def problem_words(problem: Problem, most: int = NAMED_PER_LINE) -> str:
+    """Return a problem in one sentence: kind, units, sensors or effects, and how far the error is above the noise."""
+    units = f"{len(problem.units)} units: " * (len(problem.units) > 1) + ", ".join(first(problem.units, most))
+    return "; ".join(filter(None, [f"{KINDS[problem.kind].name}: {units}", problem.what, ratio_words(problem)]))
+
+
+def ratio_words(problem: Problem) -> str:
+    """Return the range of error over noise: ``11 to 64 x noise``; empty where it is not known."""
+    if not problem.ratios:
+        return ""
+    low, high = (f"{ratio:.3g}" for ratio in problem.ratios)
+    return f"{high} x noise" if low == high else f"{low} to {high} x noise"
 
 
 def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) -> str:
@@ -190,14 +199,7 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     last entry of the history.
     """
     rows, folder = read_summary(results), str(results.parent)
-    calibrated = sum(row["status"] == "ok" for row in rows)
-    failed = f", failed: {len(rows) - calibrated}" if calibrated < len(rows) else ""
-    findings = findings_of(rows)
-    lines = [
-        f"units calibrated: {calibrated}{failed}; look at {results}/index.html",
-        *lines_of(verdict_groups(findings)),
-    ]
-    lines += _reasons(results, [row["unit"] for row in rows])
+    lines = _reasons(results, [row["unit"] for row in rows])
     lines += lines_of(beyond_limits_groups(rows))
     lines += lines_of(_not_in_uncertainty(rows).items())
     for column, words in (("left_out", "left out"), ("incomplete", "not complete")):
@@ -213,8 +215,27 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
             for (unit, run), effects in dropped(entries).items()
         ]
         lines += first(no_longer, NAMED_PER_LINE, "units that no longer have an effect")
-    lines += [f"{what}: {command}" for what, command in next_commands(findings, settings, folder)]
-    return "\n".join(lines) + "\n"
+    found = problems(rows)
+    for problem in found:
+        if problem.kind not in (FAILED, Verdict.MISSING_EFFECT):
+            lines += [problem_words(problem), f"  {command_of(problem, settings, folder)}"]
+    lines += [f"{counted(rows)}; look at {results}/index.html", *filter(None, [all_well(rows)])]
+    return "\n".join(lines + _missing(found, settings, folder)) + "\n"
+
+
+def _missing(found: Sequence[Problem], settings: Mapping[str, Any], results: str) -> list[str]:
+    """Return the last lines of a run: each unit with a missing effect, or how many there are and what lists them."""
+    missing = [problem for problem in found if problem.kind == Verdict.MISSING_EFFECT]
+    units = {unit for problem in missing for unit in problem.units}
+    if len(units) > NAMED_MISSING:
+        return [
+            f"effect missing: {len(units)} units; to list them:", f"  {explain_command(settings, ['--all'], results)}",
+            "to add to each unit its missing effects:", f"  {_command('add', settings, ['--missing'], results)}",
+        ]  # fmt: skip
+    lines = [problem_words(problem, NAMED_MISSING) for problem in missing]
+    commands = [command_of(missing[0], settings, results)] if len(missing) == 1 else []
+    commands = commands or [_command("add", settings, ["--missing"], results)] * bool(missing)
+    return lines + [f"  {command}" for command in commands]
 
 
 def _reasons(results: Path, units: Sequence[str]) -> list[str]:
@@ -303,6 +324,13 @@ def run_command(settings: Mapping[str, Any]) -> str:
     return shlex.join(["snakemake", "--cores", "2", *_config(settings)])
 
 
+def apply_command(settings: Mapping[str, Any], unit: str) -> str:
+    """Return the command that compensates a log with the calibration of a unit, for the default folder of results."""
+    campaign = str(settings.get("campaign", "demo")).rstrip("/").rpartition("/")[2]
+    file = f"{RESULTS}/{campaign}/calibrations/{unit}.json"
+    return shlex.join([*_program(), "apply", "--calibration", file, "LOG.csv", "-o", "COMPENSATED.csv"])
+
+
 def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], results: str = RESULTS) -> str:
     """Return the command that adds effects (``sensor.effect``) to the file of a unit and runs the campaign.
 
@@ -331,10 +359,13 @@ def once_command(settings: Mapping[str, Any], unit: str, override: str, results:
 
 def _command(command: str, settings: Mapping[str, Any], words: Sequence[str], results: str) -> str:
     """Return a command of this package for the campaign of a run."""
-    program = ["imu-calibration"] if INSTALLED else ["python", "-m", "pipeline"]
     folder = ["--results", results] if results != RESULTS else []
     rest = {key: value for key, value in settings.items() if key not in ("campaign", "results")}
-    return shlex.join([*program, command, str(settings.get("campaign", "demo")), *words, *folder, *_config(rest)])
+    return shlex.join([*_program(), command, str(settings.get("campaign", "demo")), *words, *folder, *_config(rest)])
+
+
+def _program() -> list[str]:
+    return ["imu-calibration"] if INSTALLED else ["python", "-m", "pipeline"]
 
 
 def _config(settings: Mapping[str, Any]) -> list[str]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections import Counter
 from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from pipeline.commands import parser_of
@@ -18,27 +19,37 @@ from pipeline.files import read_json
 from pipeline.history import read_history
 from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 from pipeline.outcome import (
-    DIAGNOSIS_FAILED,
     NOT_CONVERGED,
-    Finding,
+    all_well,
+    beyond_limits_groups,
+    command_of,
     commands_of,
-    lines_of,
-    next_commands,
+    counted,
+    explain_command,
+    place,
+    problem_words,
+    ratio_words,
     read_summary,
-    verdict_groups,
 )
 from pipeline.pack import batches_of, is_published, read_published
 from pipeline.records import SENSORS
-from pipeline.report.held_out_section import MARK_ABOVE_FLOORS
 from pipeline.report.pages import template
 from pipeline.results_folder import is_owner, read_owner
+from pipeline.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, error_of, problems
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.verdicts import Problem
 
 JSON = dict[str, Any]
+MOST_ROWS = 24  # of an overview: those of a terminal
+NARROWEST = 40  # columns, below which lines are not wrapped further
+UPPER_LIMITS = "Upper limits"  # the sentence of ``in_words`` that --limits adds
+COMMANDS = ("python -m pipeline ", "imu-calibration ", "snakemake ")
 EPILOG = """\
 examples:
+  python -m pipeline explain demo                                        what to do, in at most 24 rows
   python -m pipeline explain demo mpu6050-2-hidden                       missing effects, and the evidence
   python -m pipeline explain results/demo/calibrations/mpu6050-1.json    how to use the numbers
   python -m pipeline explain kalibr.yaml                                 likewise for a calibration of another program
@@ -53,6 +64,8 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("units", metavar="UNIT", nargs="*", help="units of the campaign (default: all)")
     words = "format of a calibration, if name and content of the file are ambiguous"
     parser.add_argument("--from", dest="format", metavar="FORMAT", help=words)
+    parser.add_argument("--all", action="store_true", help="every unit of the campaign, and every unit of a problem")
+    parser.add_argument("--limits", action="store_true", help="with the upper limits of effects that were not selected")
     arguments = parser.parse_args(argv)
     file = Path(arguments.campaign)
     if is_published(file) and not _is_diagnosis(_json(file)):
@@ -62,12 +75,26 @@ def main(argv: Sequence[str]) -> int:
         except InputError as error:
             raise InputError(f"is no diagnosis, and no calibration: {error.message}", error.file) from error
         return 0
-    sys.stdout.write(explain(*find(arguments.campaign, arguments.units, Path(arguments.results))))
+    of_campaign = not arguments.units and not is_published(file)
+    read = arguments.all or not of_campaign
+    width = max(get_terminal_size().columns, NARROWEST)
+    folder, diagnoses, failures = find(arguments.campaign, arguments.units, Path(arguments.results), read=read)
+    if not read and not (folder / "summary.csv").is_file():
+        _, diagnoses, _ = find(arguments.campaign, arguments.units, Path(arguments.results))
+    if of_campaign:
+        rows = summary_rows(folder, diagnoses, failures)
+        sys.stdout.write(overview(folder, rows, width, whole=arguments.all))
+        sys.stdout.write("\n" * arguments.all)
+    if read:
+        limits = arguments.limits or arguments.all
+        sys.stdout.write(explain(folder, diagnoses, failures, limits=limits, width=width))
     return 0
 
 
-def find(campaign: str, units: Sequence[str], results: Path) -> tuple[Path, dict[str, JSON], dict[str, JSON]]:
-    """Return the folder of the results, and the diagnoses and failures of the units.
+def find(
+    campaign: str, units: Sequence[str], results: Path, *, read: bool = True
+) -> tuple[Path, dict[str, JSON], dict[str, JSON]]:
+    """Return the folder of the results, and the diagnoses (empty without ``read``) and failures of the units.
 
     Raises ``MissingInputError`` if there are none.
     """
@@ -96,27 +123,102 @@ def find(campaign: str, units: Sequence[str], results: Path) -> tuple[Path, dict
             f"no diagnosis of unit {', '.join(absent)}; there are those of {known or 'no unit'}",
             str(folder / "diagnoses"),
         )
-    diagnoses = {unit: _json(file) for unit, file in files.items() if not units or unit in units}
+    wanted = [unit for unit in files if not units or unit in units]
+    diagnoses = {unit: _json(files[unit]) if read else {} for unit in wanted}
     for unit, document in diagnoses.items():
-        if not _is_diagnosis(document):
+        if read and not _is_diagnosis(document):
             raise InputError("is no diagnosis: it is damaged, or not of this product", str(files[unit]))
     return folder, diagnoses, {unit: f for unit, f in failures.items() if not units or unit in units}
 
 
-def explain(folder: Path, diagnoses: dict[str, JSON], failures: dict[str, JSON]) -> str:
-    """Return the diagnoses as text, each with the error on held-out motion and the commands that add effects."""
-    entries, results = read_history(folder), str(folder.parent)
-    settings = (entries[-1].get("settings") if entries else None) or {"campaign": folder.name}
+def overview(folder: Path, rows: Sequence[Mapping[str, Any]], width: int, *, whole: bool = False) -> str:
+    """Return the state of a campaign: a line and a command for each problem, in at most ``MOST_ROWS`` rows.
+
+    ``rows``: of ``summary.csv``; ``whole``: every problem with every unit, in any number of rows.
+    """
+    settings, found = _settings(folder), problems(rows)
+    head = [*filter(None, [f"{folder.name}, {counted(rows)}", all_well(rows)])]
+    limits = [
+        f"Beyond the sensor file's limits: {what.partition(',')[0]} of {len(units)} unit{'s' * (len(units) != 1)}"
+        + f" ({', '.join(units)})" * whole
+        for what, units in beyond_limits_groups(rows)
+    ]
+    lines = _wrapped(head, width) + _wrapped(limits, width)
+    for i, problem in enumerate(found):
+        shown = problem_words(problem, len(problem.units)) if whole else _short(problem)
+        step = [] if problem.kind == Verdict.MISSING_EFFECT else [f"  {problem.step}"]
+        block = [*_wrapped([shown, *step], width), f"  {command_of(problem, settings, str(folder.parent))}"]
+        if not whole and len(lines) + len(block) > MOST_ROWS - 2:
+            everything = explain_command(settings, ["--all"], str(folder.parent))
+            return "\n".join([*lines, f"{len(found) - i} more kinds of problems; to list all:", f"  {everything}", ""])
+        lines += block
+    return "\n".join([*lines, ""])
+
+
+def _short(problem: Problem) -> str:
+    """Return a problem in a short line: kind, number of units with the worst, sensors or effects, and ratio."""
+    count, worst = len(problem.units), problem.units[0]
+    units = worst if count == 1 else f"{count} units, worst {worst}"
+    return "; ".join(filter(None, [f"{KINDS[problem.kind].name}: {units}", problem.what, ratio_words(problem)]))
+
+
+def _settings(folder: Path) -> JSON:
+    """Return the settings of the last run."""
+    entries = read_history(folder)
+    return (entries[-1].get("settings") if entries else None) or {"campaign": folder.name}
+
+
+def _wrapped(lines: Sequence[str], width: int) -> list[str]:
+    """Return lines that fit the width; a command stays on one line, which a user copies."""
+    found = []
+    for line in lines:
+        indent = line[: len(line) - len(line.lstrip())]
+        if len(line) <= width or line.lstrip().startswith(COMMANDS):
+            found.append(line)
+        else:
+            found += wrap(line, width, subsequent_indent=f"{indent}  ", break_long_words=False, break_on_hyphens=False)
+    return found
+
+
+def summary_rows(folder: Path, diagnoses: Mapping[str, JSON], failures: Mapping[str, JSON]) -> list[Mapping[str, Any]]:
+    """Return the rows of ``summary.csv``; of results without one, what the diagnoses state."""
+    if (folder / "summary.csv").is_file():
+        rows = read_summary(folder)
+        if {f"{s}_verdict" for s in SENSORS} & set(rows[0] if rows else ()):
+            return [*rows]
+    rows_: list[Mapping[str, Any]] = []
+    for unit, document in diagnoses.items():
+        row: JSON = {"unit": unit, "status": "ok"}
+        for sensor in [s for s in SENSORS if document.get(s)]:
+            part = document[sensor]
+            row |= {f"{sensor}_verdict": part["verdict"], f"{sensor}_selected": ";".join(part["selected"])}
+            row |= {f"{sensor}_next_step": part["next_experiment"]}
+            row |= {"incomplete": f"diagnose/{sensor}: it failed"} if part.get("failed") else {}
+        rows_.append(row)
+    return [*rows_, *({"unit": unit, "status": "failed"} for unit in failures)]
+
+
+def explain(
+    folder: Path, diagnoses: dict[str, JSON], failures: dict[str, JSON], *, limits: bool = True, width: int = 10**6
+) -> str:
+    """Return the diagnoses as text, each with the error on held-out motion and the commands that add effects.
+
+    ``limits``: with the upper limits of effects that were not selected.
+    """
+    settings, results = _settings(folder), str(folder.parent)
     units: list[JSON] = []
     for unit, document in diagnoses.items():
         validation, calibration = (
             _json(folder / kind / f"{unit}.json") or {} for kind in ("validations", "calibrations")
         )
-        name = document.get("unit", unit)
+        name, ordered = document.get("unit", unit), sorted(SENSORS, key=lambda s: _urgency(document.get(s)))
+        words = {s: in_words(document.get(s), s) for s in ordered}
         units.append({
             "name": name,
-            "words": {s: in_words(document.get(s), s) for s in SENSORS},
+            "words": {s: [w for w in w_ if limits or not w.startswith(UPPER_LIMITS)] for s, w_ in words.items()},
+            "hidden": not limits and any(w.startswith(UPPER_LIMITS) for w_ in words.values() for w in w_),
             "validation": validation,
+            "errors": {s: error_of(validation.get(s)) for s in SENSORS},
             "verdicts": {s: (document.get(s) or {}).get("verdict") for s in SENSORS},
             "commands": {s: commands_of(document.get(s) or {}, s, name, settings, results) for s in SENSORS},
             "notes": [
@@ -146,23 +248,16 @@ def explain(folder: Path, diagnoses: dict[str, JSON], failures: dict[str, JSON])
             ],
             "board": explain_board(calibration),
         })  # fmt: skip
-    findings = [
-        Finding(unit, sensor, DIAGNOSIS_FAILED if part.get("failed") else part["verdict"], part["selected"])
-        for unit, document in diagnoses.items()
-        for sensor in SENSORS
-        if (part := document.get(sensor))
-    ]
-    counts = Counter(finding.verdict.replace("_", " ") for finding in findings).most_common()
-    counted = ", ".join(f"{count} {verdict}" for verdict, count in counts)
-    failed = [f"failed: {', '.join(failures)}"] if failures else []
     text: str = template("explain.txt").render(
         far=MARK_ABOVE_FLOORS,
-        counted=f"{len(findings)} sensors of {len(diagnoses)} units: {counted}",
-        groups=[*lines_of(verdict_groups(findings)), *failed],
-        commands=next_commands(findings, settings, results)[:-1],  # the last is this command
         units=[*units, *({"name": unit, "failure": failure} for unit, failure in failures.items())],
     )
-    return text
+    return "\n".join([*_wrapped(text.splitlines(), width), ""])
+
+
+def _urgency(part: Mapping[str, Any] | None) -> int:
+    """Return the place of a sensor in a list that begins with what can be added and what is in doubt."""
+    return place(part["verdict"]) if part else len(Verdict) + 1
 
 
 def _is_diagnosis(document: object) -> bool:

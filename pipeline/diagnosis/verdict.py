@@ -301,7 +301,7 @@ def _next_step(verdict: Verdict, diagnosis: SensorDiagnosis, e: VerdictInput) ->
     if verdict != Verdict.LEFT_BY_METHOD:
         return ""
     changes = ["the equations as corrected (method.as_printed=false)"] if e.as_printed else []
-    free = ["the default method" if e.given else "a method that fits the full matrix (reference_least_squares)"]
+    free = ["the default method" if e.given else "a method that fits the full matrix (method=reference_least_squares)"]
     changes += [] if e.fit.free else free
     changes += ["no filter (filter=none)"] if e.filtered else []
     return f"calibrate the same recordings with {' and '.join(changes)}" if changes else ""

@@ -13,18 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.outcome import beyond_limits_groups, findings_of, next_commands, verdict_groups
+from pipeline.outcome import all_well, beyond_limits_groups, command_of, counts_of, explain_command, ratio_words
 from pipeline.records import SENSOR_UNITS, SENSORS, Index, Values
 from pipeline.report.chart import Area, Dots, Figure, Layer, LineMark, Panel, chart, sentences
 from pipeline.report.fleet import parameter_table, wide
-from pipeline.report.held_out_section import MARK_ABOVE_FLOORS
 from pipeline.report.numbers import number, percent, plain, unit_text
 from pipeline.report.pages import script_data, template
 from pipeline.report.parameters import COLUMNS
-from pipeline.verdicts import Verdict
+from pipeline.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, error_in_row, kinds_of, problems
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
 
 JSON = dict[str, Any]
@@ -34,6 +33,7 @@ NAMED_UNITS = 3  # units that the finding of a chart names
 FEWEST_UNITS, FAR_SHOWN = 3, 30  # units of the smallest distribution; most units far from the others that are listed
 MOST_DOTS, FARTHEST_UNITS = 2000, 50  # units above which dots show only the farthest from the noise, and their number
 QUANTILE_PARTS = 100  # of the fleet, each with its quantiles: one in 3.5 px
+MOST_PROBLEMS = 12  # lines of the list of what to do
 MOST_GROUPS = 50  # serials of several units, and joint estimates, that are listed
 MOST_LOTS = 60  # lots above which no medians lot by lot are shown
 
@@ -51,6 +51,7 @@ def render(
     history: JSON | None = None,
     settings: JSON | None = None,
     published: Collection[str] | None = None,
+    about: Mapping[str, Any] | None = None,
 ) -> str:
     """Return ``index.html``.
 
@@ -58,13 +59,16 @@ def render(
     message, file`` of each failed unit; ``comparisons``: of ``comparison.section``; ``page``: name of a further page;
     ``twins``: of ``gather.same_files``; ``statistics``: of ``fleet_statistics``; ``parameters``: of
     ``parameter_table`` for all units; ``history``: of ``runs_data``; ``settings``: of the run, for the proposed
-    commands; ``published``: units with a page where pages are published on request only, None: all.
+    commands; ``published``: units with a page where pages are published on request only, None: all; ``about``: the
+    number of the last run that changed something, its day, and the version of this package.
     """
-    findings = findings_of(rows)
+    settings, found = settings or {"campaign": campaign}, problems(rows)
+    devices = {row.get("serial") or row["unit"] for row in rows}
     frame = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))
     judged = [row.get("pass") for row in rows]
     serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
     fleet = [unit_chart for sensor in SENSORS if (unit_chart := _fleet_figure(sensor, frame))]
+    overview = [unit_chart for sensor in SENSORS if (unit_chart := overview_chart(sensor, rows))]
     fitted = parameter_table({}) if parameters is None else parameters
     plots = strips(rows, fitted)
     causes: dict[str, list[str]] = {}
@@ -95,12 +99,20 @@ def render(
         far_shown=FAR_SHOWN,
         far=MARK_ABOVE_FLOORS,
         causes=sorted(causes.items(), key=lambda cause: -len(cause[1])),
-        found=verdict_groups(findings) + beyond_limits_groups(rows) + _not_held_out(rows),
-        commands=next_commands(findings, settings or {"campaign": campaign}),
+        about=about or {},
+        devices=len(devices),
+        counts=counts_of(rows),
+        kinds=KINDS,
+        well=all_well(rows).replace(" x noise", " × noise"),
+        problems=[(p, ratio_words(p).replace(" x ", " × "), command_of(p, settings)) for p in found],
+        most_problems=MOST_PROBLEMS,
+        all_command=explain_command(settings, ["--all"]),
+        limited=beyond_limits_groups(rows),
+        overview=[figure for figure, _ in overview],
         history=history,
         history_data=script_data({"units": history["units"]}) if history else None,
         names=script_data([row["unit"] for row in rows]),
-        values=script_data({figure.name: values for figure, values in [*fleet, *plots]}),
+        values=script_data({figure.name: values for figure, values in [*overview, *fleet, *plots] if values}),
         first=FIRST_ROWS,
         sections=comparisons,
         verdicts={verdict: verdict.css_class for verdict in Verdict},
@@ -112,10 +124,61 @@ def render(
     return text
 
 
-def _not_held_out(rows: Sequence[JSON]) -> list[tuple[str, list[str]]]:
-    """Return the units with errors on the samples of the fit instead of held-out motion, by sensor."""
-    by_sensor = [(s, [row["unit"] for row in rows if row.get(f"{s}_not_held_out")]) for s in SENSORS]
-    return [(f"{sensor}, not checked on held-out motion", units) for sensor, units in by_sensor if units]
+def overview_chart(sensor: str, rows: Sequence[JSON]) -> UnitChart | None:
+    """Draw the error over the noise floor of each unit, and return the text of each dot by its colour.
+
+    Up to ``NAMED_ROWS`` units: a row with the name of the unit, its ratio before and after, the worst first; of more
+    units, a histogram of the ratio after calibration. None where no ratio is known.
+    """
+    errors = [error_in_row(row, sensor) for row in rows]
+    known = sorted((i for i, e in enumerate(errors) if e.ratio), key=lambda i: -(errors[i].ratio or 0.0))
+    if not known:
+        return None
+    ratio = np.array([errors[i].ratio for i in known], float)
+    ready = np.array([not any(sensor in of for of in kinds_of(rows[i]).values()) for i in known])
+    worst, far = rows[known[0]]["unit"], int(np.count_nonzero(ratio > MARK_ABOVE_FLOORS))
+    middle = f", median {number(float(np.median(ratio)))} ×" if len(known) > 1 else ""
+    finding = f"{sensor.capitalize()}: {far} of {len(known)} units above {MARK_ABOVE_FLOORS:g} × noise"
+    finding += f"; {number(float(ratio[0]))} × in {worst}" if far else f"; at most {number(float(ratio[0]))} ×"
+    kind = "vector" if all(errors[i].kind == "vector" for i in known) else "magnitude"
+    caption = f"Error of the {kind} on held-out motion, over the error that noise alone gives; lines: 1 × and 3 ×."
+    description, label = f"{finding}{middle}.", "error over noise floor (logarithmic)"
+    states = ((ready, 2, "ready"), (~ready, 0, "not ready"))
+    if len(known) > NAMED_ROWS:
+        edges = np.linspace(np.log10(min(ratio.min(), 1.0)), np.log10(max(ratio.max(), 3.0)) + 1e-9, HISTOGRAM_BINS + 1)
+        counts = np.array([np.histogram(np.log10(ratio[of]), edges)[0] for of, *_ in states], float)
+        tops = np.cumsum(counts, axis=0)
+        layers: list[Layer] = []
+        for low, high, (of, colour, _) in zip([np.zeros(HISTOGRAM_BINS), tops[0]], tops, states, strict=True):
+            if of.any():
+                layers.append(Area(np.repeat(low, 2), np.repeat(high, 2), colour, 10.0 ** np.repeat(edges, 2)[1:-1]))
+        top = 1.1 * float(tops[-1].max())
+        layers += [LineMark(np.full(2, x), np.array([0.0, top]), 3, "dashed") for x in (1.0, MARK_ABOVE_FLOORS)]
+        layers.append(LineMark(10.0 ** ((edges[1:] + edges[:-1]) / 2), tops[-1], 5, "model"))
+        legend = (*((f"c{colour}", text) for of, colour, text in states if of.any()), ("c5", "units of a bin"))
+        figure = Figure(f"ratio-{sensor}", finding, caption, legend)
+        return chart(figure, description, [Panel(layers, "units", 150, limits=(0.0, top))], label, kind="log"), {}
+    y = len(known) - np.arange(len(known), dtype=float)  # the first row on top
+    before = np.array([(errors[i].before or np.nan) / (errors[i].floor or np.nan) for i in known])
+    gap = np.full(len(known), np.nan)
+    layers = [LineMark(np.full(2, x), np.array([0.4, y[0] + 1.4]), 5, "dashed") for x in (1.0, MARK_ABOVE_FLOORS)]
+    layers.append(LineMark(np.stack([before, ratio, gap], 1).ravel(), np.repeat(y, 3), 3, "model"))
+    numbers, values, legend_ = np.array(known) + 1, {}, []
+    for v, of, colour, text in ((before, np.isfinite(before), 3, "before"), *((ratio, *state) for state in states)):
+        if of.any():
+            layers.append(Dots(v[of], y[of], colour, units=tuple(numbers[of].tolist())))
+            legend_.append((f"c{colour}", text if colour == 3 else f"after, {text}"))
+            values[f"c{colour}"] = [f"{text}: {number(x)} × noise" for x in v[of].tolist()]
+    names = [(x, y[0] + 0.7, f"{x:g} ×") for x in (1.0, MARK_ABOVE_FLOORS)]
+    short = [_shortened(rows[i]["unit"]) for i in reversed(known)]
+    left = round(NAME_LETTER * max(map(len, short))) + 10
+    panel = Panel(layers, "", ROW * (len(known) + 1), limits=(0.4, y[0] + 1.4), rows=short, names=names)
+    figure = Figure(f"ratio-{sensor}", finding, caption, tuple(legend_))
+    return chart(figure, description, [panel], label, kind="log", margin=0.03, left=left, units="units"), values
+
+
+def _shortened(name: str) -> str:
+    return name if len(name) <= LETTERS else f"{name[: LETTERS - 8]}…{name[-7:]}"
 
 
 def _medians(name: str, frame: pd.DataFrame) -> list[JSON]:
@@ -225,7 +288,8 @@ MAX_DRAWN_SHARE = 3.0  # largest share that is drawn: one unit in a wrong unit o
 # siblings below which there is no plot, and above which only the farthest are drawn
 FEWEST_SIBLINGS, MAX_PLOTTED_UNITS = 3, 60
 ENDS = 20  # farthest units of each parameter that are then drawn, on either side
-ROW, LEFT = 17, 130  # px
+ROW, LEFT, LETTERS, NAME_LETTER = 17, 130, 22, 7.2  # px; letters of a unit's name, px of each
+NAMED_ROWS, HISTOGRAM_BINS = 40, 40  # most units with a row of their own; bins of the histogram of more units
 # of a row: range over which the units are distributed in their order; half height of a bar
 ROW_SPREAD, HALF_BAR = 0.6, 0.42
 

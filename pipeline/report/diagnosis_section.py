@@ -50,9 +50,9 @@ def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:
     """Return the upper limits of each effect that was not selected as text, and as share of the sensor file's limit.
 
     ``share`` is None where the sensor file has no limit; the largest come first. ``excluded``: whether the recordings
-    exclude an effect of the size of that limit.
+    exclude an effect of the size of that limit, and no answer of the answer set contains it.
     """
-    rows = []
+    rows, open_effects = [], {name for answer in found.get("answer_set") or [] for name in answer["effects"]}
     for name, limits in (found.get("upper_limit") or {}).items():
         effect = catalogue().get(name)
         stated: dict[str, float] = {}
@@ -66,7 +66,7 @@ def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:
             "effect": name,
             "text": text,
             "share": share,
-            "excluded": share is not None and share < EXCLUDED * prior_limit(),
+            "excluded": share is not None and share < EXCLUDED * prior_limit() and name not in open_effects,
         }
         if shares:
             most = limits[max(shares, key=shares.__getitem__)]

@@ -1,8 +1,8 @@
 """Charts of groups: a row for each value, stems in groups, and means along an axis.
 
-On a logarithmic axis only the end of a bar has a meaning, its length has none. So each row shows its number, and levels
-(the noise floor) are lines across all rows. A row with an interval is the mean of several units: a dot with its 95 %
-interval and faint dots for the units. The description of the chart for screen readers states the values.
+On a logarithmic axis a value is a dot, as the length of a bar would have no meaning. Each row shows its number, and
+levels (the noise floor) are lines across all rows. A row with an interval is the mean of several units: a dot with its
+95 % interval and faint dots for the units. The description of the chart for screen readers states the values.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pipeline.report.numbers import number
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-ROW, LEFT, RIGHT = 30, 6, 64  # px
+ROW, LEFT, RIGHT, HALF_TICK = 30, 6, 64, 14  # px; half of a tick's text
 BRACKET = 48  # px, width of a bracket
 COLOURS = 6  # of the style sheet: c0 to c5
 DECADE = 8.0  # largest over smallest x above which an axis x is logarithmic: the values fill nearly a decade
@@ -31,7 +31,7 @@ LOWEST = -100.0  # smallest value to which a bar on a symlog axis is drawn
 class Point:
     """One value; None has no bar.
 
-    ``interval``: low and high of a mean, drawn instead of the bar; ``units``: the values that are averaged; ``floor``:
+    ``interval``: low and high of a mean, drawn with the dot; ``units``: the values that are averaged; ``floor``:
     value of this row by noise alone; ``x, series``: position in ``curves``, which joins the points of a series;
     ``note``: part of the description.
     """
@@ -71,7 +71,7 @@ def bars(
         positive = [v for v in (*values, *levels.values()) if v > 0] or [0.1, 1.0]
         ends = [min(positive) / (1.1 if means else 2.0), max(positive) * 1.15]
     stop = WIDTH - (26 if means else RIGHT) - BRACKET * len(brackets)
-    axis = Axis.over([np.array(ends)], LEFT + 20 * means, stop, kind, margin=0.0)
+    axis = Axis.over([np.array(ends)], LEFT + (20 if means else HALF_TICK), stop, kind, margin=0.0)
     top = 16 if levels else 4
     bottom = top + ROW * len(rows)
     ticks = axis.ticks(5)
@@ -85,7 +85,7 @@ def bars(
         out.append(text(min(max(at, LEFT + half), WIDTH - half), top - 4, words, "m"))
     for at, row in drawn:
         if row.value is not None and row.interval is None:
-            digits, left = number(row.value), max(axis.pixels(0.0), axis.pixels(row.value)) + 4
+            digits, left = number(row.value), max(axis.pixels(0.0), axis.pixels(row.value)) + 4 + 4 * (kind == "log")
             lines = [line for line in map(axis.pixels, levels.values()) if left < line < left + LETTER * len(digits)]
             out.append(text(max(lines, default=left - 4) + 4, at + 24, digits, "value"))  # right of a level, not on it
     out += [_row(row, axis, top + ROW * i) for i, row in enumerate(rows) if row.value is None]
@@ -116,7 +116,10 @@ def _row(row: Point, axis: Axis, top: int) -> str:
     label = f"{row.label}: {number(row.value)}" if row.interval else row.label
     out, end = text(LEFT, top + 11, label, "b"), axis.pixels(row.value)
     if row.interval is None:
-        zero = axis.pixels(0.0)  # the start of a logarithmic axis
+        zero = axis.pixels(0.0)
+        if axis.kind == "log":  # the length of a bar would have no meaning
+            dot = f'<path class="mean-dot c{row.colour}" d="M{end:.1f} {top + 20}h0"/>'
+            return f'{out}<path class="grid" d="M{axis.start:.1f} {top + 20}H{end:.1f}"/>{dot}'
         return f'{out}<path class="bar c{row.colour}" d="M{zero:.1f} {top + 15}H{end:.1f}v10H{zero:.1f}z"/>'
     middle, (low, high) = top + 21, row.interval
     out += f"<g><title>{escape(f'{label} ({number(low)} to {number(high)})')}</title>"

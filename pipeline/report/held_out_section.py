@@ -18,12 +18,12 @@ from pipeline.validation.error_breakdown import with_known_effects
 from pipeline.validation.samples import OTHER, samples_of_motion
 
 if TYPE_CHECKING:
+    from pipeline.report.numbers import Scale
     from pipeline.settings import Table
 
 JSON = dict[str, Any]
 # held-out errors of diagnosis and validation that agree within this factor are shown as one series
 EQUAL_ERROR_FACTOR = 1.2
-MARK_ABOVE_FLOORS = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good
 SOURCES = {
     "static": "the static recording",
     "rests": "the rests",
@@ -62,20 +62,22 @@ def step_label(name: str) -> str:
     return plain(name.replace("stage:", "after ", 1))
 
 
-def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Figure | None:
-    """Draw the held-out error after each step, with the noise floor; None where it is unknown.
+def error_steps(sensor: str, held_out: JSON, found: JSON, scale: Scale, *, vector: bool) -> Figure | None:
+    """Draw the held-out error after each step, with the noise floor, in a unit with prefix; None where it is unknown.
 
     ``held_out, found``: the sensor's parts of validation and diagnosis; effects that the diagnosis selected are further
     steps. ``vector``: the error of the vector instead of the magnitude.
     """
-    prefix, unit = "vector_" if vector else "", SENSOR_UNITS[sensor]
-    key, steps, floor = f"{prefix}rms_error", held_out.get("steps", []), held_out.get(f"{prefix}noise_floor")
+    prefix, unit = "vector_" if vector else "", scale.unit
+    key, floor = f"{prefix}rms_error", held_out.get(f"{prefix}noise_floor")
+    floor = floor / scale.factor if floor else floor
+    steps = [{**s, key: s[key] / scale.factor if s.get(key) is not None else None} for s in held_out.get("steps", [])]
     if not steps or all(s.get(key) is None for s in steps):
         return None
     rows = [Point(step_label(s["name"]), s.get(key), 3 if s["name"] == "raw" else 2) for s in steps]
     reached, added = steps[-1].get(key), []
     if vector or all(s.get("vector_rms_error") is None for s in steps):
-        added = _steps_if_added(found, reached)
+        added = _steps_if_added(found, reached, scale.factor)
     kind = "vector" if vector else "magnitude"
     keys = ("source", "wander_source", "correlation_time_source") if "noise" in held_out else ()
     finding, caption, _ = sentences(
@@ -93,16 +95,23 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Fi
     return bars(figure, rows + added, label, levels={f"noise floor {number(floor)}": floor or 0.0})
 
 
-def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:
-    """Return the errors with each selected effect added; empty if the diagnosis starts from another error."""
+def _steps_if_added(found: JSON, reached: float | None, factor: float) -> list[Point]:
+    """Return the errors over ``factor`` with each selected effect; empty if the diagnosis starts from another error.
+
+    The diagnosis states the errors of its own fits; the one that is reached is reduced in the same ratio.
+    """
     entries = {r["effect"]: r for r in found.get("ranking") or []}
     chosen = [entries[name] for name in found.get("selected") or [] if name in entries]
     if not chosen or not reached or any(r.get("held_out_error_after") is None for r in chosen):
         return []
-    if not 1.0 / EQUAL_ERROR_FACTOR < chosen[0]["held_out_error_before"] / reached < EQUAL_ERROR_FACTOR:
+    start = chosen[0]["held_out_error_before"] / factor
+    if not 1.0 / EQUAL_ERROR_FACTOR < start / reached < EQUAL_ERROR_FACTOR:
         return []
     words = "if added with the suggested shape" if found.get("suggested_effect") else "if added"
-    return [Point(f"+ {plain(r['effect'])}, {words}", r["held_out_error_after"], 4) for r in chosen]
+    return [
+        Point(f"+ {plain(r['effect'])}, {words}", r["held_out_error_after"] / factor * reached / start, 4)
+        for r in chosen
+    ]
 
 
 def held_out_figures(

@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 import re
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 NOTHING = "\N{EN DASH}"
+PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"))
 MINUS = "\N{MINUS SIGN}"
 TYPOGRAPHIC = {
     "+-": "±",
@@ -52,6 +53,16 @@ def measured(value: float | None, expanded: float | None) -> str:
     return f"{value:z.{decimals}f} ± {expanded:.{decimals}f}".replace("-", MINUS)
 
 
+def measured_row(values: Sequence[float], expanded: Sequence[float | None]) -> list[str]:
+    """Return values of one row, and the largest of their expanded uncertainties as ``± U``, to two digits of it."""
+    known = [U for U in expanded if U is not None and math.isfinite(U) and U > 0.0]
+    if not known:
+        return [*(number(value, 5) for value in values), ""]
+    decimals = min(max(0, 1 - math.floor(math.log10(max(known)))), 9)
+    texts = [f"{value:z.{decimals}f}".replace("-", MINUS) for value in values]
+    return [*texts, f"± {max(known):.{decimals}f}"]
+
+
 def span(low: float, high: float) -> str:
     """Return an interval of positive values to the decimals of its high end; "at most" where the low one is 0."""
     if not 1e-4 <= high < 1e5:
@@ -59,6 +70,27 @@ def span(low: float, high: float) -> str:
     upper = number(high)
     lower = f"{low:.{len(upper.partition('.')[2])}f}"
     return f"{lower} to {upper}" if float(lower) else f"at most {upper}"
+
+
+class Scale(NamedTuple):
+    """An SI prefix for values of a column: value in ``unit`` = value / ``factor``."""
+
+    factor: float
+    unit: str
+
+
+def scale_of(unit: str, *values: float | None) -> Scale:
+    """Return the prefix (none, m, µ) with which the largest of the values, in g or deg/s, is at least 1."""
+    largest = max((abs(v) for v in values if v is not None and math.isfinite(v)), default=0.0)
+    if largest <= 0.0 or not unit.startswith(("g", "deg/s")):
+        return Scale(1.0, unit_text(unit))
+    factor, prefix = next((p for p in PREFIXES if largest >= p[0]), PREFIXES[-1])
+    return Scale(factor, f"{prefix}{unit_text(unit)}")
+
+
+def in_unit(value: object, scale: Scale) -> str:
+    """Return a value of a column in the column's unit."""
+    return number(value / scale.factor) if isinstance(value, int | float) else NOTHING
 
 
 def percent(share: object) -> str:

@@ -16,14 +16,24 @@ from markupsafe import Markup
 from pipeline.estimation.candidates import is_fixed
 from pipeline.report import numbers
 from pipeline.report.numbers import measured, number, plain, unit_text
-from pipeline.verdicts import Verdict
+from pipeline.verdicts import Verdict, error_in_row, kinds_of
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping
 
 JSON = dict[str, Any]
 FOLDER = Path(__file__).parent / "templates"
-OF_NUMBERS = ("aligned", "measured", "number", "percent", "percent_change", "probability", "span", "typeset")  # filters
+OF_NUMBERS = (
+    "aligned",
+    "in_unit",
+    "measured",
+    "number",
+    "percent",
+    "percent_change",
+    "probability",
+    "span",
+    "typeset",
+)  # filters
 PUBLISHED = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # in a campaign's page
 
 
@@ -45,6 +55,7 @@ def _environment() -> Environment:
     environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text}
     environment.filters |= {"parameter_texts": parameter_texts, "details": stage_details, "monte_carlo": monte_carlo_of}
     environment.filters |= {"script_data": script_data, "numeric": "#{}".format}
+    environment.filters |= {"error": error_in_row, "kinds": kinds_of}
     environment.globals |= {"asset": asset, "unit_link": unit_link, "Verdict": Verdict}
     return environment
 

@@ -36,7 +36,7 @@ from pipeline.records import (
 )
 from pipeline.report.held_out_section import first_and_last_step, passes
 from pipeline.report.numbers import plain
-from pipeline.verdicts import Verdict
+from pipeline.verdicts import Verdict, error_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,7 +52,15 @@ SENSOR_COLUMNS = (
 KINDS = ("beyond_limits", "implausible", "not_in_uncertainty", "not_held_out")
 OF_CALIBRATION = tuple(f"{s}_{c}" for c in KINDS for s in SENSORS)
 OF_UNIT = ("left_out", "incomplete")  # ``incomplete``: written by ``gather``, which knows what no stage could make
-COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, *OF_UNIT)
+# the error of the vector, where the attitude is known, and the next step where the verdict is not ``nothing_missing``
+NEXT = tuple(
+    f"{s}_{c}"
+    for s in SENSORS
+    for c in ("vector_error_before", "vector_error_after", "vector_noise_floor", "next_step")
+)
+COLUMNS = (
+    *UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, *OF_UNIT, *NEXT
+)  # fmt: skip
 PARAMETERS = ("sensor", "parameter", "label", "measure", "value", "u", "U", "limit", "beyond", "fitted")
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
@@ -210,6 +218,11 @@ def summary_row(
         row[f"{sensor}_beyond_limits"] = ";".join(e["parameter"] for e in beyond) or None
         row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) or None
         row[f"{sensor}_not_held_out"] = held_out.get("reason")
+        vector = error_of(held_out)
+        figures = vector[1:] if vector.kind == "vector" else (None,) * 3
+        step = found.get("next_experiment") if found.get("verdict") != Verdict.NOTHING_MISSING else None
+        of_sensor = [name for name in NEXT if name.startswith(sensor)]
+        row |= dict(zip(of_sensor, (*figures, step or None), strict=True))
         row[f"{sensor}_not_in_uncertainty"] = "; ".join(source for source, _ in beyond_uncertainty(part)) or None
     for key, value in units_table_row.items():
         if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:

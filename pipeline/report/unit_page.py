@@ -11,8 +11,8 @@ import numpy as np
 
 from pipeline.files import json_text
 from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
-from pipeline.outcome import as_overrides, commands_of, found_mountings, place, run_command
-from pipeline.records import MATRIX, SENSOR_UNITS, SENSORS, Recording, Values
+from pipeline.outcome import apply_command, as_overrides, commands_of, found_mountings, place, run_command
+from pipeline.records import AXES, BIAS, MATRIX, SENSOR_UNITS, SENSORS, Recording, Values
 from pipeline.report.chart import Figure, Layer, LineMark, Panel, chart
 from pipeline.report.diagnosis_section import (
     added_variable,
@@ -23,22 +23,20 @@ from pipeline.report.diagnosis_section import (
     upper_limits,
 )
 from pipeline.report.held_out_section import (
-    MARK_ABOVE_FLOORS,
     attitude_over_time,
     checks,
     error_steps,
-    first_and_last_step,
     held_out_figures,
     passes,
     step_label,
 )
 from pipeline.report.noise_section import allan, remarks, term_rows
-from pipeline.report.numbers import NOTHING, number
+from pipeline.report.numbers import NOTHING, measured_row, number, scale_of
 from pipeline.report.pages import template
-from pipeline.report.parameters import fitted_parameters, parameter_rows
+from pipeline.report.parameters import fitted_parameters, parameter_rows, summary_row
 from pipeline.report.residual_section import measurement_and_model, residual_figures, residuals
 from pipeline.signal.rests import Rest, rests_from_table
-from pipeline.verdicts import css_class
+from pipeline.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, css_class, error_of, kinds_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,6 +48,8 @@ LEFT, LANE, LETTERS = 86, 17, 13  # px of the names, px of a lane, letters of a 
 USES = {"used": 1, "held out": 2, "left out": 0}  # of the rests that a fit found in the readings, with their colours
 LOGGED = 4  # colour of rests from a table's log
 NARROWEST = 0.002  # of the axis: the smallest width of a rest
+MOST_REASONS = 3  # sentences that are shown without unfolding
+KINDS_OF_ERROR = ("vector", "magnitude")
 ANGLE_STEP_S = 0.2  # over which a rate is computed from an angle: an encoder of 0.01 deg gives it to 0.05 deg/s
 STILL_ANGLE = 0.1  # deg/s, two steps of such an encoder
 STILL = 0.02  # deg/s, below which a table's log is noise of its rate
@@ -72,6 +72,7 @@ def render(
     ``recordings``: after the filter, may be empty; ``settings``: the unit's resolved configuration; ``words``: the
     diagnosis of each sensor in sentences; ``incomplete``: ``stage`` and ``message`` of what could not be made.
     """
+    row = summary_row(str(calibration.get("unit")), calibration, validation, diagnosis, {})
     validation, diagnosis, words = validation or {}, diagnosis or {}, words or {}
     attitude, moves = validation.get("attitude") or {}, validation.get("gravity_direction") or {}
     ok, rests = calibration.get("status") == "ok", {r.name: rests_from_table(r) for r in recordings}
@@ -89,11 +90,14 @@ def render(
         else:
             held_out, found = validation.get(sensor) or {}, diagnosis.get(sensor) or {}
             shown |= _sensor(sensor, calibration, held_out, found, recordings=recordings, settings=settings)
-            shown["words"] = words.get(sensor) or []
+            shown |= _sentences(words.get(sensor) or [], found)
         sensors.append(shown)
     page: str = template("unit.html").render(
         calibration=calibration,
         ok=ok,
+        problems=kinds_of(row | {"incomplete": "; ".join(f"{r['stage']}: {r['message']}" for r in incomplete)}),
+        kinds=KINDS,
+        apply=apply_command(settings.stated.run, str(calibration.get("unit"))) if ok and settings.stated.run else None,
         passed=passes(calibration, validation),
         checks=checks(validation),
         left_out=left_out(calibration.get("inputs")),
@@ -134,24 +138,32 @@ def _sensor(
     part, table = calibration[sensor], settings.table
     data_sheet = settings.sensor.of(sensor)
     noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
-    first, last = first_and_last_step(held_out)
+    error = error_of(held_out)
+    scale = scale_of(SENSOR_UNITS[sensor], error.after, error.floor)
     at_rest = (calibration.get("noise") or {}).get(sensor)
     limits, kind = limit_rows(sensor, found, data_sheet), css_class(found.get("verdict"))
     kind = "warn" if found.get("failed") else kind
     likely = (found.get("answer_set") or [{}])[0].get("effects")
     logged = any(v is not None for r in recordings for v in (r.table_attitude, r.table_rate, r.table_angle))
-    far = (last.get("rms_error") or 0.0) > MARK_ABOVE_FLOORS * (held_out.get("noise_floor") or np.inf)
+    far = (error.ratio or 0.0) > MARK_ABOVE_FLOORS
+    steps = {kind: error_steps(sensor, held_out, found, scale, vector=kind == "vector") for kind in KINDS_OF_ERROR}
+    evidence = [added_variable(sensor, found), *unexplained(sensor, found)]
+    dependence = residual_figures(sensor, traces, noise)
+    over = [ranking(sensor, found), upper_limits(sensor, limits)]
+    cause = next((figure for figure in (*evidence, *dependence, *over) if figure), None)
     parameters, run = parameter_rows(sensor, part, data_sheet), settings.stated.run
     return {
         "held_out": held_out,
-        "before": first.get("rms_error"),
-        "after": last.get("rms_error"),
+        "error": error,
+        "scale": scale,
+        "use_rows": use_rows(part, at_rest),
         "floor": held_out.get("noise_floor"),
         "steps": [{**step, "label": step_label(step["name"])} for step in held_out.get("steps", [])],
-        "step_figures": [error_steps(sensor, held_out, found, vector=vector) for vector in (False, True)],
+        "why_figures": [cause, steps[error.kind]],
+        "step_figures": [figure for kind, figure in steps.items() if kind != error.kind],
         "model_figures": [measurement_and_model(sensor, r, noise) for r in traces],
         "held_out_figures": held_out_figures(sensor, calibration, held_out, recordings, table),
-        "residual_figures": residual_figures(sensor, traces, noise),
+        "residual_figures": [figure for figure in dependence if figure is not cause],
         "noise_figure": allan(sensor, at_rest, data_sheet, found.get("wander")),
         "noise_terms": term_rows(at_rest),
         "noise_remarks": remarks(at_rest),
@@ -161,12 +173,7 @@ def _sensor(
         "rests": rest_rows(part),
         "diagnosis": found,
         "ranking": ranking_rows(found),
-        "evidence_figures": [
-            ranking(sensor, found),
-            added_variable(sensor, found),
-            *unexplained(sensor, found),
-            upper_limits(sensor, limits),
-        ],
+        "evidence_figures": [figure for figure in (*over, *evidence) if figure is not cause],
         "limits": limits,
         "implausible": sentences(sensor, part),
         "beyond": beyond_uncertainty(part),
@@ -177,6 +184,51 @@ def _sensor(
         "commands": commands_of(found, sensor, str(calibration.get("unit")), run)
         if (run := settings.stated.run)
         else {},
+    }
+
+
+def use_rows(part: JSON, noise: JSON | None) -> list[JSON]:
+    """Return what a user of the calibration needs by axis: bias and matrix with U, and the noise terms N, B and K.
+
+    A row has ``name``, ``key`` of its definition, ``texts`` of x, y, z and U, and ``unit`` with an SI prefix. ``part``,
+    ``noise``: the sensor's parts of a calibration, and of its ``noise``.
+    """
+    bias, matrix = fitted_parameters(part)[BIAS], fitted_parameters(part)[MATRIX]
+    rows: list[JSON] = []
+    lines = [("bias", bias), *((f"matrix {axis}", matrix[3 * i : 3 * i + 3]) for i, axis in enumerate(AXES))]
+    for name, line in lines:
+        scale = scale_of(line[0].unit, *(v for p in line for v in (p.value, p.expanded_uncertainty)))
+        U = [p.expanded_uncertainty and p.expanded_uncertainty / scale.factor for p in line]
+        texts = measured_row([p.value / scale.factor for p in line], U)
+        rows.append({"name": name, "key": "", "texts": texts, "unit": scale.unit})
+    axes = [axis["terms"] or {} for axis in ((noise or {}).get("axes") or {}).values()]
+    for term, symbol in (("white", "N"), ("bias_instability", "B"), ("random_walk", "K")):
+        found = [terms.get(term) for terms in axes]
+        if any(found):
+            unit = next(each["unit"] for each in found if each)
+            sizes = [(each or {}).get("value") or (each or {}).get("upper_limit") for each in found]
+            scale = scale_of(unit, *sizes)
+            limits = ["" if (each or {}).get("value") else "< " for each in found]
+            texts = [
+                f"{less}{number(v / scale.factor)}" if v else NOTHING for less, v in zip(limits, sizes, strict=True)
+            ] + [""]
+            rows.append({"name": f"noise {symbol}", "key": symbol, "texts": texts, "unit": scale.unit})
+    return rows
+
+
+def _sentences(words: Sequence[str], found: JSON) -> JSON:
+    """Return the sentences of a diagnosis by the part of the page that has them: verdict, why, and further evidence."""
+    verdict, *others = words or ["There is no diagnosis."]
+    folded = ("Upper limits", "Not observable", "Next experiment", "+- ", "To distinguish", "What is missing")
+    why = [line for line in others if not line.startswith(folded)][:MOST_REASONS]
+    hidden = ("Upper limits", "Not observable", "Next experiment")  # in tables, and on the card
+    further = [line for line in others if line not in why and not line.startswith(hidden)]
+    step = str(found.get("next_experiment") or "")
+    return {
+        "verdict_words": verdict,
+        "why": why,
+        "further": further,
+        "next_step": "" if found.get("verdict") == Verdict.NOTHING_MISSING and step.startswith("none") else step,
     }
 
 

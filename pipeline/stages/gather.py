@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from pipeline import __version__
 from pipeline.errors import PipelineError, failure_of
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record
@@ -187,6 +188,7 @@ def _write_campaign(job: Job, units: Mapping[str, JSON], parameters: pd.DataFram
         parameters=parameters,
         history=runs_data(entries, run["run"]),
         settings=run["run"],
+        about={"run": entries[-1]["run"], "day": str(entries[-1]["time"])[:10], "version": __version__},
         published={page.stem for page in (new / "reports").glob("*.html")} if packed else None,
     )
     write_atomically(new / "index.html", page)

@@ -9,6 +9,12 @@ import pytest
 from pipeline.commands.explain import find, main
 from pipeline.errors import InputError, MissingInputError
 
+
+def unwrapped(text: str) -> str:
+    """Return the text of a terminal as one line."""
+    return " ".join(text.split())
+
+
 OVERRIDE = "effects.gyroscope=[g_sensitivity]"
 
 
@@ -63,7 +69,7 @@ def test_a_parameter_beyond_the_data_sheet_is_told(results: Path, capsys: pytest
     (folder / "U1.json").write_text(json.dumps({"accelerometer": None, "gyroscope": {"implausible": [entry]}}))
     main([str(results / "bench"), "U1"])
     said = "bias x is +90 deg/s, 4.5 times the sensor file's limit of 20 deg/s. Likely cause: dust."
-    assert said in capsys.readouterr().out
+    assert said in unwrapped(capsys.readouterr().out)
 
 
 def test_what_the_rests_do_not_determine_is_told(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -86,9 +92,9 @@ def test_an_error_far_above_the_noise_is_told_with_that_of_held_out_moves(
     document = {"accelerometer": None, "gyroscope": judged, "gravity_direction": moves}
     (results / "bench" / "validations" / "U1.json").write_text(json.dumps(document))
     main([str(results / "bench"), "U1"])
-    said = capsys.readouterr().out
+    said = unwrapped(capsys.readouterr().out)
     assert "0.1 deg/s, 10 times the noise floor." in said
-    assert "explain up to 0.225 deg/s: the uncertainty of the calibration" in said
+    assert "explain an error of the magnitude of up to 0.225 deg/s: the uncertainty of the calibration" in said
     assert "explains an error this far above the noise, but does not show that the calibration is good" in said
     assert "direction of gravity by 2.9 deg (rms); noise and stated uncertainties explain at most 8.8 deg" in said
 
@@ -118,7 +124,7 @@ def test_a_fit_that_passes_through_its_rests_states_no_error(results: Path, caps
     assert main(["bench", "U1", "--results", str(results)]) == 0
     told = capsys.readouterr().out
     assert f"Not judged on held-out motion: {reason}." in told
-    assert "rms error" not in told
+    assert "The error of" not in told
 
 
 def test_the_missing_effect_is_named_with_its_size_and_the_commands_that_add_it(
@@ -132,7 +138,8 @@ def test_the_missing_effect_is_named_with_its_size_and_the_commands_that_add_it(
     assert lines[lines.index("To add it:") + 1] == f"python -m pipeline add bench U2 gyroscope.g_sensitivity {where}"
     once = f"""snakemake --cores 2 --config campaign=bench 'unit_overrides={{U2: ["{OVERRIDE}"]}}' results={results}"""
     assert lines[lines.index("To add it for one run only:") + 1] == once
-    for expected in ("misses g sensitivity", "9.1 times the noise", "0.101"):
+    said = unwrapped(said)
+    for expected in ("misses g sensitivity", "9.1 times its noise", "0.101"):
         assert expected in said
     assert "The accelerometer was not calibrated" in said
 
@@ -143,14 +150,18 @@ def test_a_campaign_begins_with_its_verdicts_by_effect_and_tells_failed_units_wi
     failure = {"unit": "U3", "stage": "ingest", "code": "bad_input", "message": "no number", "file": "raw/U3/a.csv:9"}
     (results / "bench" / "failures.json").write_text(json.dumps([failure]))
     assert main(["bench", "--results", str(results)]) == 0
-    said = capsys.readouterr().out
-    head, *units = said.split("\n\n")
-    assert head.splitlines() == [
-        "2 sensors of 2 units: 1 nothing missing, 1 missing effect",
-        "gyroscope, g_sensitivity missing: U2",
+    head = capsys.readouterr().out.splitlines()
+    assert head == [
+        "bench, 3 units: 1 ready, 1 effect missing, 1 failed",
         "failed: U3",
-        f"to add what is missing: python -m pipeline add bench U2 gyroscope.g_sensitivity --results {results}",
+        "  correct the cause, then run the same command again",
+        f"  snakemake --cores 2 --config campaign=bench results={results}",
+        "effect missing: U2; gyroscope: g sensitivity",
+        f"  python -m pipeline add bench U2 gyroscope.g_sensitivity --results {results}",
     ]
+    assert main(["bench", "--all", "--results", str(results)]) == 0
+    shown, *units = capsys.readouterr().out.split("\n\n")
+    assert shown.splitlines() == head
     assert [text.splitlines()[0] for text in units] == ["U1", "U2", "U3"]
     assert main(["bench", "U3", "--results", str(results)]) == 0
     told = capsys.readouterr().out
@@ -178,4 +189,4 @@ def test_the_held_out_error_of_the_run_is_told_beside_what_noise_alone_leaves(
     gyroscope = {"unit": "deg/s", "noise_floor": 0.011, "steps": [{"rms_error": 4.0}, {"rms_error": 0.022}]}
     (folder / "U2.json").write_text(json.dumps({"accelerometer": None, "gyroscope": gyroscope}))
     assert main([str(results / "bench"), "U2"]) == 0
-    assert "on held-out motion is 0.022 deg/s, 2 times the noise floor" in capsys.readouterr().out
+    assert "on held-out motion is 0.022 deg/s, 2 times the noise floor" in unwrapped(capsys.readouterr().out)

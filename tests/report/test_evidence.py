@@ -16,7 +16,7 @@ from pipeline.report.axis import scaled
 from pipeline.report.diagnosis_section import _column_unit, added_variable, ranking, unexplained
 from pipeline.report.held_out_section import error_steps
 from pipeline.report.noise_section import allan, remarks, term_rows
-from pipeline.report.numbers import number
+from pipeline.report.numbers import Scale, number
 from pipeline.report.residual_section import harmonic_noise, harmonics, residual_figures, residuals
 from pipeline.report.unit_page import render
 
@@ -77,7 +77,7 @@ def test_evidence_against_every_effect_is_drawn_to_the_left_of_zero() -> None:
     assert figure is not None
     (_, zero, _, near), (_, _, _, far) = BAR.findall(figure.svg)
     assert float(far) < float(near) < float(zero)
-    assert figure.finding == "No effect passes the threshold: at best, hysteresis reaches −8.00"
+    assert figure.finding == "No effect has evidence: the largest ΔBIC is −8.00"
     assert ranking("gyroscope", {"ranking": []}) is None
 
 
@@ -234,6 +234,9 @@ def test_a_harmonic_above_the_noise_is_named(unit: Unit) -> None:
     assert any(re.match(r"accel_\w: 2 cycles a turn on \w, 0.00\d+ g, above the noise", f) for f in findings)
 
 
+IN_G = Scale(1e-3, "mg")
+
+
 def test_the_stairs_go_on_to_what_the_missing_effect_would_bring() -> None:
     steps = [
         {"name": "raw", "rms_error": 1.0, "vector_rms_error": 2.0},
@@ -243,18 +246,16 @@ def test_the_stairs_go_on_to_what_the_missing_effect_would_bring() -> None:
     held_out["noise"] = {"source": "static", "wander_source": "data_sheet", "correlation_time_source": "data_sheet"}
     found = diagnosis_of("accelerometer")
     found["ranking"][0] |= {"held_out_error_before": 0.19, "held_out_error_after": 0.021}
-    figure = error_steps("accelerometer", held_out, found, vector=True)
+    figure = error_steps("accelerometer", held_out, found, IN_G, vector=True)
     assert figure is not None
     assert "+ quadratic nonlinearity, if added" in figure.svg
-    assert "White noise is known from the static recording, bias wander from the sensor file" in figure.caption
-    assert figure.finding == (
-        "The error of the vector ends at 0.200 g, 10.0 × the noise floor; with the missing effects, at 0.0210"
-    )
-    magnitude = error_steps("accelerometer", held_out, found, vector=False)
+    assert "White noise by the static recording, bias wander by the sensor file" in figure.caption
+    assert figure.finding == ("The error of the vector ends at 200 mg, 10.0 × noise; with the missing effects, at 22.1")
+    magnitude = error_steps("accelerometer", held_out, found, IN_G, vector=False)
     assert magnitude is not None
     assert "if added" not in magnitude.svg  # the diagnosis tells the error of the vector
     found["ranking"][0]["held_out_error_before"] = 0.5
-    other = error_steps("accelerometer", held_out, found, vector=True)
+    other = error_steps("accelerometer", held_out, found, IN_G, vector=True)
     assert other is not None
     assert "if added" not in other.svg  # the method's calibration is not the diagnosis's base
 

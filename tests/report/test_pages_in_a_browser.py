@@ -107,7 +107,7 @@ def one_chart(layer: LineMark | SampleMarks) -> str:
 
 
 def opened(browser: Browser, path: Path, **settings: Any) -> Page:
-    """Open a page that fails the test at its end if it asks for anything or reports an error."""
+    """Open a page with its parts unfolded; the test fails at its end if the page asks for anything or reports an error."""
     page = browser.new_context(**settings).new_page()
     page.set_default_timeout(20_000)
     page.asked, page.wrong = [], []  # type: ignore[attr-defined]
@@ -115,6 +115,7 @@ def opened(browser: Browser, path: Path, **settings: Any) -> Page:
     page.on("console", lambda m: page.wrong.append(m.text) if m.type in ("error", "warning") else None)  # type: ignore[attr-defined]
     page.on("pageerror", lambda e: page.wrong.append(str(e)))  # type: ignore[attr-defined]
     page.goto(path.as_uri())
+    page.evaluate("document.querySelectorAll('details.part').forEach((part) => { part.open = true })")
     return page
 
 
@@ -284,8 +285,8 @@ def test_a_chart_of_many_units_shows_quantiles_and_names_the_farthest(
     assert told.items() <= farthest.items()
     assert len(told) == 4
     with page.expect_download() as saved:
-        page.locator("figure").first.hover()
-        page.get_by_role("button", name="CSV").first.click()
+        page.locator("figure", has=picture).first.hover()
+        page.locator("figure", has=picture).first.get_by_role("button", name="CSV").click()
     rows = csv.DictReader(saved.value.path().read_text().splitlines())
     assert {row["unit"]: row["stated"] for row in rows if row["unit"]} == farthest
     assert left_alone(page, file)
@@ -347,7 +348,7 @@ def test_any_two_runs_are_compared_with_the_largest_change_first(browser: Browse
     ]
     page.locator("#run-b").select_option("1")
     assert page.locator("#runs-said").text_content() == "No unit differs between these runs."
-    told = page.locator("#runs .card").inner_text()
+    told = page.locator(".card", has_text="no longer has").inner_text()
     assert "U9: run 3 no longer has gyroscope.g_sensitivity, which run 2 had." in told
     assert f"python -m pipeline add factory U9 gyroscope.g_sensitivity --results {pages.parent}" in told
     assert left_alone(page, pages / "campaign.html")
@@ -461,7 +462,7 @@ def test_a_wide_table_is_folded_on_a_phone_and_on_no_other_screen(browser: Brows
     assert wide <= shown
     before = "e => getComputedStyle(e, '::before').content"
     told = [page.locator(f"#all tbody tr:first-child > :nth-child({k})").evaluate(before) for k in (2, 8, 9)]
-    assert told == ['"result"', '"Accelerometer, before"', '"after"']
+    assert told == ['"state"', '"Accelerometer, before"', '"after"']
     page.set_viewport_size({"width": 900, "height": 900})
     page.locator("#all:not(.folded)").wait_for()
     page.context.close()
@@ -493,6 +494,45 @@ def test_the_contents_stay_in_view_and_tell_where_the_reader_is(browser: Browser
     below = page.locator(".contents .parts a").all_text_contents()
     assert below == page.locator("#gyroscope h3").all_text_contents()
     assert left_alone(page, pages / "unit.html")
+    page.context.close()
+
+
+def test_a_link_into_a_folded_part_opens_it(browser: Browser, pages: Path) -> None:
+    page = browser.new_page()
+    page.goto((pages / "unit.html").as_uri())
+    assert page.locator("details.part[open]").count() == 0
+    page.locator(".contents a[href='#provenance']").click()
+    page.locator("#provenance-part[open]").wait_for()
+    page.goto(f"{(pages / 'unit.html').as_uri()}#gyroscope-parameters")
+    page.locator("#gyroscope-parameters-part[open]").wait_for()
+    page.context.close()
+
+
+@pytest.mark.parametrize("units", [9, 100])
+def test_every_row_is_printed(browser: Browser, tmp_path: Path, units: int) -> None:
+    (tmp_path / "index.html").write_text(campaign_page.render("bench", fleet()[:units], []))
+    page = opened(browser, tmp_path / "index.html")
+    page.emulate_media(media="print")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    box, rows = page.locator(".tall").bounding_box() or {}, page.locator("#all tbody tr")
+    last = rows.nth(units - 1).bounding_box() or {}
+    assert rows.count() == units
+    assert last["y"] + last["height"] <= box["y"] + box["height"] + 1.0
+    page.context.close()
+
+
+@pytest.mark.parametrize("width", [390, 900, 1300, 1900])
+def test_pages_fit_every_window_with_few_words_and_a_first_screen(browser: Browser, pages: Path, width: int) -> None:
+    page = browser.new_context(viewport={"width": width, "height": 900}).new_page()
+    page.goto((pages / "unit.html").as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    assert len(page.inner_text("body").split()) < 1200
+    clipped = (
+        """all => all.filter((e) => e.checkVisibility() && e.scrollWidth > e.clientWidth + 1).map((e) => e.outerHTML)"""
+    )
+    assert page.eval_on_selector_all(".card .scroll, figure, .big", clipped) == []
+    if width == 1300:
+        assert page.evaluate("document.documentElement.scrollHeight") < 3500
     page.context.close()
 
 

@@ -8,6 +8,8 @@ if (location.protocol === "file:" && folder.at(-1) !== "results") {
     code.textContent += option.endsWith("=") ? ` ${quoted(`${option.trim()}${path}`)}` : `${option}${quoted(path)}`;
   }
 }
+for (const code of document.querySelectorAll("code[data-folder]"))
+  if (location.protocol === "file:" && folder.at(-1) !== "results") code.textContent = code.textContent.replace("results/", `${folder.join("/")}/`);
 for (const button of document.querySelectorAll(".copy button")) {
   button.hidden = false;
   button.addEventListener("click", () => {
@@ -57,7 +59,12 @@ const narrow = matchMedia("screen and (max-width: 700px)"), folds = [...document
 const fold = () => folds.forEach((part) => part.open = !narrow.matches);
 narrow.addEventListener("change", fold);
 fold();
-const unfold = () => { const part = location.hash && document.getElementById(decodeURIComponent(location.hash.slice(1)))?.closest("details.fold"); if (part) part.open = true; };
+const unfold = () => {
+  const target = location.hash && document.getElementById(decodeURIComponent(location.hash.slice(1)));
+  if (!target) return;
+  for (let part = target.closest("details"); part; part = part.parentElement.closest("details")) part.open = true;
+  target.scrollIntoView();
+};
 addEventListener("hashchange", unfold);
 addEventListener("beforeprint", () => folds.forEach((part) => part.open = true));
 unfold();

@@ -1,0 +1,167 @@
+"""One quantity has one value wherever it is stated, and no page contradicts itself."""
+
+import copy
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.commands.explain import explain
+from pipeline.diagnosis.words import in_words
+from pipeline.files import write_json
+from pipeline.outcome import counted
+from pipeline.records import SENSORS
+from pipeline.report import campaign_page
+from pipeline.report.chart import Figure
+from pipeline.report.diagnosis_section import limit_rows
+from pipeline.report.group_charts import Point, bars
+from pipeline.report.parameters import summary_row
+from pipeline.report.unit_page import render
+from pipeline.verdicts import error_in_row, error_of, kinds_of, problems
+
+from .conftest import SHEET, Unit, build_unit
+from .test_pages import Text
+
+
+@pytest.fixture(scope="module")
+def known() -> Unit:
+    """Return a unit with a known attitude, whose magnitude and vector have different errors over different floors."""
+    unit = build_unit()
+    part = unit.validation["accelerometer"]
+    part["noise_floor"], part["vector_noise_floor"] = 0.003, 0.005
+    part["steps"][0] |= {"rms_error": 0.0689, "vector_rms_error": 0.1172}
+    part["steps"][-1] |= {"rms_error": 0.0031, "vector_rms_error": 0.0265}
+    return unit
+
+
+def test_the_error_has_one_value_on_page_index_summary_and_terminal(known: Unit, tmp_path: Path) -> None:
+    words = {s: in_words(known.diagnosis[s], s) for s in SENSORS}
+    page = render(*known.arguments, words=words)
+    card = page[page.index("<h2>Accelerometer</h2>") :]
+    big = Text(card[: card.index("</p>")]).text
+    assert " 26.5 mg error , 5.30 × noise ; 117 before" in big
+    visible = re.sub(r'<details class="part".*', "", page, flags=re.DOTALL)
+    findings = re.findall(r'<p class="finding">(.*?)</p>', visible)
+    assert "The error of the vector ends at 26.5 mg, 5.30 × noise" in " ".join(findings)
+    assert not re.search(r"\b3\.1\d* mg|0\.0031\b", Text(visible[visible.index("<main") :]).text)
+    row = summary_row("U1", known.calibration, known.validation, known.diagnosis, {})
+    assert error_in_row(row, "accelerometer") == error_of(known.validation["accelerometer"])
+    assert row["accelerometer_error_after"] == 0.0031  # columns of summary.csv keep their meaning
+    index = Text(campaign_page.render("bench", [row], [])).text
+    assert " 0.117 0.0265 0.00500 5.30 " in index
+    for kind, document in (("validations", known.validation), ("calibrations", known.calibration)):
+        write_json(tmp_path / kind / "U1.json", document)
+    told = explain(tmp_path, {"U1": known.diagnosis | {"unit": "U1"}}, {})
+    assert "The error of the vector on held-out motion is 0.0265 g, 5.3 times the noise floor." in told
+    assert "0.0031 g" not in told
+
+
+def test_units_are_counted_once_by_their_most_urgent_problem() -> None:
+    of_unit = {
+        "status": "ok",
+        "serial": "S",
+        "accelerometer_verdict": "nothing_missing",
+        "gyroscope_verdict": "nothing_missing",
+    }
+    missing = {"gyroscope_verdict": "missing_effect", "gyroscope_selected": "g_sensitivity"}
+    far = {"gyroscope_error_after": 0.4, "gyroscope_noise_floor": 0.1}
+    rows: list[dict[str, Any]] = [
+        of_unit | {"unit": "a"},
+        of_unit | {"unit": "b", "accelerometer_verdict": "unexplained"} | missing,
+        of_unit | {"unit": "c"} | far,
+        of_unit | {"unit": "d", "pass": "False"},
+        of_unit | {"unit": "e", "incomplete": "diagnose/gyroscope: x", "gyroscope_verdict": "not_enough_data"},
+        {"unit": "f", "serial": "S", "status": "failed"},
+    ]
+    kinds = [next(iter(kinds_of(row)), "ready") for row in rows]
+    assert kinds == ["ready", "missing_effect", "far_above_noise", "beyond_acceptance", "incomplete", "failed"]
+    found = {p.kind: (p.what, p.units) for p in problems(rows)}
+    assert found["missing_effect"] == ("gyroscope: g sensitivity", ["b"])
+    assert found["unexplained"] == ("accelerometer", ["b"])
+    assert "not_enough_data" not in found
+    assert counted(rows).startswith("6 units: 1 ready, 1 not complete, 1 effect missing, 1 far above noise")
+    page = campaign_page.render("bench", rows, [])
+    assert [int(n) for n in re.findall(r"<b>(\d+)</b> [a-z ]+</abbr>", page)] == [1, 1, 1, 1, 1, 1]
+
+
+def test_a_campaign_whose_units_are_ready_says_so() -> None:
+    row = {"unit": "U1", "serial": "S", "status": "ok", "accelerometer_verdict": "nothing_missing"}
+    row |= {"accelerometer_error_after": 0.0103, "accelerometer_noise_floor": 0.01}
+    said = "All 2 units are ready: nothing that the recordings can show is missing, and the error on held-out motion is"
+    assert f"{said} at most 1.03 × noise." in Text(campaign_page.render("bench", [row, row | {"unit": "U2"}], [])).text
+
+
+def test_every_problem_has_a_next_step_and_a_command(known: Unit) -> None:
+    row = summary_row("U1", known.calibration, known.validation, known.diagnosis, {})
+    for verdict in ("reference_in_doubt", "unexplained", "floor_in_doubt", "left_by_method", "not_enough_data"):
+        for step in ("", "calibrate with a method (method=reference_least_squares) and no filter (filter=none)"):
+            given = row | {"accelerometer_verdict": verdict, "accelerometer_next_step": step, "gyroscope_verdict": None}
+            page = campaign_page.render("bench", [given], [])
+            lines = re.findall(r'<tr><th scope="row" class="\w+-text"><abbr.*?</tr>', page, re.DOTALL)
+            assert lines
+            assert all(len(Text(line).text.split()) > 8 and "<pre" in line for line in lines)
+            if step:
+                assert "[method=reference_least_squares, filter=none]" in Text(page).text
+
+
+@pytest.mark.parametrize(("units", "named"), [(40, True), (41, False)])
+def test_up_to_40_units_have_a_row_of_their_own_in_the_overview(units: int, *, named: bool) -> None:
+    rows: list[dict[str, Any]] = [
+        {"unit": f"U{i:02}", "status": "ok", "gyroscope_verdict": "nothing_missing" if i else "unexplained",
+         "gyroscope_error_before": 1.0, "gyroscope_error_after": 0.01 * (units - i), "gyroscope_noise_floor": 0.1}
+        for i in range(units)
+    ]  # fmt: skip
+    drawn = campaign_page.overview_chart("gyroscope", rows)
+    assert drawn is not None
+    figure, _ = drawn
+    far = sum(0.1 * (units - i) > 3.0 for i in range(units))
+    assert figure.finding.startswith(f"Gyroscope: {far} of {units} units above 3 × noise; {0.1 * units:.2f} × in U00")
+    rows_of_names = re.findall(r">(U\d\d)</text>", figure.svg)
+    assert rows_of_names == ([f"U{i:02}" for i in reversed(range(units))] if named else [])
+    assert ("units" in (re.search(r"data-scale=\"[^\"]*,(\w+)\"", figure.svg.split("panel")[1]) or [""])[0]) != named
+
+
+def test_nothing_to_distinguish_is_proposed_beside_an_experiment_that_is_not_needed() -> None:
+    part = {"verdict": "nothing_missing", "residual_over_noise": 1.0, "selected": [], "ranking": [], "unexplained": [],
+            "not_observable": [], "answer_set": [{"effects": [], "probability": 0.93}],
+            "to_distinguish": "nothing (0.93) from bias drift (0.01): return to the first pose"}  # fmt: skip
+    none = "none is needed: nothing that these recordings can show is missing"
+    assert not [w for w in in_words(part | {"next_experiment": none}, "gyroscope") if w.startswith("To distinguish")]
+    assert [w for w in in_words(part | {"next_experiment": "x"}, "gyroscope") if w.startswith("To distinguish")]
+
+
+@pytest.mark.parametrize(("p", "said"), [(1e-115, "p < 1e-12"), (0.0, "p < 1e-12"), (2.3e-7, "p = 2.3e-07")])
+def test_a_small_p_value_is_a_bound_on_page_and_terminal(known: Unit, p: float, said: str) -> None:
+    diagnosis = copy.deepcopy(known.diagnosis)
+    diagnosis["gyroscope"] |= {"unexplained": [{"covariate": "time", "p_value": p}], "selected": []}
+    words = {s: in_words(diagnosis[s], s) for s in SENSORS}
+    assert f"depends on time ({said})" in " ".join(words["gyroscope"])
+    page = Text(render(known.calibration, known.validation, diagnosis, [], known.settings, words=words)).text
+    shown = re.findall(r"time \((p [=<] [^)]+)\)", page)
+    assert len(set(shown)) == 1
+
+
+def test_an_effect_of_the_answer_set_is_not_excluded(known: Unit) -> None:
+    limit = SHEET["effects"]["quadratic_nonlinearity"]
+    found = {"upper_limit": {"quadratic_nonlinearity": {"K2_x": {"value": 0.1 * limit, "unit": "1/g"}}}}
+    sheet = known.settings.sensor.accelerometer
+    for effects, excluded in (([], True), (["quadratic_nonlinearity"], False)):
+        answers = [{"effects": [], "probability": 0.9}, {"effects": effects, "probability": 0.06}]
+        (row,) = limit_rows("accelerometer", found | {"answer_set": answers}, sheet)
+        assert row["excluded"] is excluded
+
+
+def test_the_label_of_a_tick_is_at_its_line() -> None:
+    figure = bars(
+        Figure("n", "f"), [Point("a", 30.0), Point("b", 4.0)], "delta BIC", levels={"10": 10.0}, kind="symlog"
+    )
+    lines = [float(x) for x in re.findall(r"M([\d.]+) \d+v14", re.findall(r'class="grid" d="([^"]*)"', figure.svg)[0])]
+    (label,) = re.findall(r'<text x="([\d.]+)" y="[\d.]+" class="m">0</text>', figure.svg)
+    assert float(label) in lines
+
+
+def test_values_on_a_logarithmic_axis_are_dots() -> None:
+    drawn = [bars(Figure("n", "f"), [Point("a", 30.0)], "error", kind=kind).svg for kind in ("log", "symlog")]
+    assert ["mean-dot" in svg for svg in drawn] == [True, False]
+    assert ['class="bar' in svg for svg in drawn] == [False, True]
