@@ -46,7 +46,7 @@ SETTING = re.compile(r"\(([a-z_.]+=\w+)\)")  # a setting within a next step
 
 
 class Kind(NamedTuple):
-    """A kind of problem: name in lists, meaning, next step where a diagnosis names none, and class of the style sheet."""
+    """A kind of problem: name in lists, meaning, next step where a diagnosis names none, class of style."""
 
     name: str
     meaning: str

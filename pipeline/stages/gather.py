@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from pipeline import __version__
 from pipeline.errors import PipelineError, failure_of
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record
@@ -27,6 +26,7 @@ from pipeline.report.parameters import Parameter
 from pipeline.report.run_section import runs_data, times_of, with_history
 from pipeline.results_folder import NEW_FOLDER, PUBLISHED, finish_publishing, publish, published_units, record_units
 from pipeline.stages.summary import failed_files, failed_summary
+from pipeline.version import VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -188,7 +188,7 @@ def _write_campaign(job: Job, units: Mapping[str, JSON], parameters: pd.DataFram
         parameters=parameters,
         history=runs_data(entries, run["run"]),
         settings=run["run"],
-        about={"run": entries[-1]["run"], "day": str(entries[-1]["time"])[:10], "version": __version__},
+        about={"run": entries[-1]["run"], "day": str(entries[-1]["time"])[:10], "version": VERSION},
         published={page.stem for page in (new / "reports").glob("*.html")} if packed else None,
     )
     write_atomically(new / "index.html", page)

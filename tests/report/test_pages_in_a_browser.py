@@ -107,7 +107,7 @@ def one_chart(layer: LineMark | SampleMarks) -> str:
 
 
 def opened(browser: Browser, path: Path, **settings: Any) -> Page:
-    """Open a page with its parts unfolded; the test fails at its end if the page asks for anything or reports an error."""
+    """Open a page, its parts unfolded; the test fails at its end if it asks for anything or reports an error."""
     page = browser.new_context(**settings).new_page()
     page.set_default_timeout(20_000)
     page.asked, page.wrong = [], []  # type: ignore[attr-defined]
