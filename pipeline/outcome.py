@@ -210,8 +210,8 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     if entries:
         lines += first(_changes(entries), NAMED_PER_LINE, "sensors that changed")
         no_longer = [
-            f"{unit}: this run no longer has {', '.join(effects)}, which run {run} had; "
-            f"to have it in every run: {add_command(settings, unit, effects, folder)}"
+            f"{unit}: this run no longer has {', '.join(effects)}, which run {run} had; to have it in every run:\n"
+            f"  {add_command(settings, unit, effects, folder)}"
             for (unit, run), effects in dropped(entries).items()
         ]
         lines += first(no_longer, NAMED_PER_LINE, "units that no longer have an effect")
@@ -293,11 +293,18 @@ def _changes(entries: Sequence[JSON]) -> list[str]:
             words = ", ".join(change.words(sensor)).replace("\N{MINUS SIGN}", "-").replace("\N{RIGHTWARDS ARROW}", "->")
             floor = after[sensor].get("floor")
             ratio = f", {errors[1] / floor:.3g} times the noise floor" if floor else ""
-            line = f"held-out error {errors[0]:.3g} -> {errors[1]:.3g} {UNITS[sensor]}{ratio}"
+            line = f"held-out error of the magnitude {errors[0]:.3g} -> {errors[1]:.3g} {UNITS[sensor]}{ratio}"
             uncertainty = uncertainty_words(before[sensor], after[sensor], UNITS[sensor])
             line += f"\n  {uncertainty}" if uncertainty else ""
             lines.append((factor, f"{unit}, {sensor}: {words}; {line}"))
     return [line for _, line in sorted(lines, key=lambda entry: -entry[0])]
+
+
+def changes_of(results: Path, units: Sequence[str]) -> list[str]:
+    """Return what the last run changed in some units, as its last lines state it."""
+    entries = read_history(results)
+    lines = _changes(entries) if entries else []
+    return [line for line in lines if line.partition(", ")[0] in units]
 
 
 def uncertainty_words(before: JSON, after: JSON, unit: str) -> str:

@@ -15,10 +15,10 @@ from pipeline.commands.run import run_snakemake
 from pipeline.config.campaign import TAKE_OVER, find_campaign, read_layers
 from pipeline.config.devices import edit_effects, sensor_and_effect
 from pipeline.config.owner import require_own_results
-from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
+from pipeline.errors import ConfigurationError, MissingInputError, PipelineError, first
 from pipeline.files import write_atomically
 from pipeline.model.effects import catalogue
-from pipeline.outcome import RESULTS, read_summary, run_command
+from pipeline.outcome import NAMED_PER_LINE, RESULTS, changes_of, read_summary, run_command
 from pipeline.pack import read_published
 from pipeline.records import SENSORS
 from pipeline.verdicts import Verdict
@@ -130,7 +130,16 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
         print(f"then: {command}")
         return 0
     print(f"runs: {command}", flush=True)
-    return run_snakemake(arguments, arguments.config)
+    code = run_snakemake(arguments, arguments.config)
+    results = Path(arguments.results) / directory.name
+    own = changes_of(results, list(effects_of)) if code == 0 else []
+    print(
+        "\n".join(
+            first(own, NAMED_PER_LINE, "sensors that changed")
+            or ["no sensor of these units has another error"] * (code == 0)
+        )
+    )
+    return code
 
 
 def _bench_note(effects: Iterable[tuple[str, str]]) -> str:

@@ -17,7 +17,7 @@ from pipeline.outcome import all_well, beyond_limits_groups, command_of, counts_
 from pipeline.records import SENSOR_UNITS, SENSORS, Index, Values
 from pipeline.report.chart import Area, Dots, Figure, Layer, LineMark, Panel, chart, sentences
 from pipeline.report.fleet import parameter_table, wide
-from pipeline.report.numbers import number, percent, plain, unit_text
+from pipeline.report.numbers import Scale, number, percent, plain, scale_of, unit_text
 from pipeline.report.pages import script_data, template
 from pipeline.report.parameters import COLUMNS
 from pipeline.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, error_in_row, kinds_of, problems
@@ -117,7 +117,7 @@ def render(
         sections=comparisons,
         verdicts={verdict: verdict.css_class for verdict in Verdict},
         sensors=[s for s in SENSORS if frame[f"{s}_error_after"].notna().any()] or SENSORS,
-        units=SENSOR_UNITS,
+        scales={s: _scale(s, rows) for s in SENSORS},
         kept=sorted(set(frame) - set(COLUMNS)),
         page=page,
     )
@@ -179,6 +179,12 @@ def overview_chart(sensor: str, rows: Sequence[JSON]) -> UnitChart | None:
 
 def _shortened(name: str) -> str:
     return name if len(name) <= LETTERS else f"{name[: LETTERS - 8]}…{name[-7:]}"
+
+
+def _scale(sensor: str, rows: Sequence[JSON]) -> Scale:
+    """Return the SI prefix for the errors of a sensor, by their median after calibration."""
+    errors = [after for row in rows if (after := error_in_row(row, sensor).after) is not None]
+    return scale_of(SENSOR_UNITS[sensor], float(np.median(errors)) if errors else None)
 
 
 def _medians(name: str, frame: pd.DataFrame) -> list[JSON]:

@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from pipeline.estimation.candidates import is_fixed
 from pipeline.report import numbers
-from pipeline.report.numbers import measured, number, plain, unit_text
+from pipeline.report.numbers import Scale, measured, number, plain, unit_text
 from pipeline.verdicts import Verdict, error_in_row, kinds_of
 
 if TYPE_CHECKING:
@@ -37,9 +37,9 @@ OF_NUMBERS = (
 PUBLISHED = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # in a campaign's page
 
 
-def _figure(value: object) -> str:
-    """Return a number for a cell, empty for another value."""
-    return number(value) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
+def _figure(value: object, scale: Scale | None = None) -> str:
+    """Return a number for a cell of a column with an SI prefix, empty for another value."""
+    return number(value / (scale.factor if scale else 1.0)) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
 
 
 @cache

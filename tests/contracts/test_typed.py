@@ -24,7 +24,7 @@ TAKE_JSON = {
         "commands/explain.py", "commands/noise.py", "diagnosis/words.py", "exports/", "field_logs/compensate.py",
         "history.py", "io/arrow.py", "io/axis_maps.py", "io/digests.py", "model/calibration_file.py",
         "model/compensation.py", "model/open_effects.py", "outcome.py", "planning/plan.py", "records/", "report/",
-        "result.py", "results_folder.py", "stages/", "study/result.py", "thesis/page.py",
+        "result.py", "results_folder.py", "stages/", "study/result.py", "thesis/page.py", "verdicts.py",
     ),
 }  # fmt: skip
 

@@ -87,7 +87,7 @@ def test_a_results_folder_of_version_1_is_read_as_tables(results: Path) -> None:
 def test_explain_convert_and_add_take_documents_of_version_1(
     results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert explain.main([str(results)]) == 0
+    assert explain.main([str(results), "--all"]) == 0
     assert "The model of the gyroscope misses g sensitivity." in capsys.readouterr().out
     file = results / "calibrations" / f"{UNIT}.json"
     assert explain.main([str(file)]) == 0

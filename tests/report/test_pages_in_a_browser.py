@@ -186,7 +186,7 @@ def test_the_table_of_all_units_sorts_by_keyboard_with_empty_cells_last(browser:
     heading.locator("button").focus()
     page.keyboard.press("Enter")
     assert heading.get_attribute("aria-sort") == "ascending"
-    known = sorted(r["accelerometer_error_after"] for r in fleet() if "accelerometer_error_after" in r)
+    known = sorted(1e3 * r["accelerometer_error_after"] for r in fleet() if "accelerometer_error_after" in r)  # mg
     first = [float(v) for v in column(page, 9)]
     assert first == pytest.approx(known[: len(first)], rel=5e-3)
     page.keyboard.press("Enter")

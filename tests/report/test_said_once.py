@@ -49,7 +49,7 @@ def test_the_error_has_one_value_on_page_index_summary_and_terminal(known: Unit,
     assert error_in_row(row, "accelerometer") == error_of(known.validation["accelerometer"])
     assert row["accelerometer_error_after"] == 0.0031  # columns of summary.csv keep their meaning
     index = Text(campaign_page.render("bench", [row], [])).text
-    assert " 0.117 0.0265 0.00500 5.30 " in index
+    assert " 117 26.5 5.00 5.30 " in index
     for kind, document in (("validations", known.validation), ("calibrations", known.calibration)):
         write_json(tmp_path / kind / "U1.json", document)
     told = explain(tmp_path, {"U1": known.diagnosis | {"unit": "U1"}}, {})
