@@ -233,7 +233,7 @@ def explain(
                     for s in SENSORS
                     for source, reason in beyond_uncertainty(calibration.get(s))
                 ),
-                *(f"{s.capitalize()}: {words}." for s in SENSORS if (words := frame_words(calibration.get(s)))),
+                *(f"{s.capitalize()}: {of_frame}." for s in SENSORS if (of_frame := frame_words(calibration.get(s)))),
                 *(
                     f"{s.capitalize()}: {reason}."
                     for s in SENSORS
