@@ -390,6 +390,8 @@ class Certificate(Section):
     sampling: Text = None
     external_results: Text = None
     opinions: Text = None
+    adjusted: Text = None
+    next_date: Date = None
 
 
 class Unit(Section):

@@ -21,15 +21,18 @@ from markupsafe import Markup
 
 from pipeline.model.calibration_file import beyond_uncertainty, frame_words
 from pipeline.outcome import run_command
-from pipeline.records import SENSORS
+from pipeline.records import AXES, SENSORS
 from pipeline.report.held_out_section import first_and_last_step
+from pipeline.report.numbers import number, plain
 from pipeline.report.pages import template
-from pipeline.report.parameters import fitted_parameters
+from pipeline.report.parameters import fitted_parameters, reading_errors
 from pipeline.report.unit_page import files_read
+from pipeline.verdicts import KINDS, Verdict, error_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from pipeline.report.parameters import Parameter
     from pipeline.settings import Certificate, Settings
 
 JSON = dict[str, Any]
@@ -38,6 +41,10 @@ ONLY_THIS_ITEM = "The results relate only to the item calibrated."
 COVERAGE = (
     "The expanded uncertainty is the standard uncertainty multiplied by the coverage factor k of each value, for a "
     "coverage probability of about 95 %."
+)
+REPRODUCTION = "This report may be reproduced in full only, unless the laboratory approves otherwise."
+NOT_ADJUSTED = "Nothing was adjusted in the item: as found are its readings, as left those with this calibration."
+    "Nothing was adjusted in the item: as found are its readings, as left its readings with this calibration."
 )
 SOFTWARE_SAYS = "Accreditation and traceability are the laboratory's statements; the software asserts neither."
 DAY = re.compile(r"\d{4}-\d{2}-\d{2}")
@@ -61,11 +68,17 @@ ASKED = (
 )  # statements that the standard requires: name, clause and the key to set
 
 
-def certificate(calibration: JSON, validation: JSON | None, settings: Settings, temperature: str | None) -> JSON:
+def certificate(
+    calibration: JSON,
+    validation: JSON | None,
+    settings: Settings,
+    temperature: str | None,
+    diagnosis: JSON | None = None,
+) -> JSON:
     """Return the report of one calibrated unit.
 
     ``settings``: of the unit; ``temperature``:
-    range of the sensor's temperature, degC, None where it was not recorded.
+    range of the sensor's temperature, degC, None where it was not recorded; ``diagnosis``: of the unit.
     """
     stated = settings.certificate
     document: JSON = {
@@ -73,6 +86,7 @@ def certificate(calibration: JSON, validation: JSON | None, settings: Settings, 
         "administrativeData": _administrative(calibration, stated, settings.stated.row),
         "measurementResults": [
             _result(sensor, calibration, (validation or {}).get(sensor) or {}, settings, temperature)
+            | {"model": model_state((validation or {}).get(sensor), (diagnosis or {}).get(sensor))}
             for sensor in SENSORS
             if calibration.get(sensor)
         ],
@@ -109,6 +123,7 @@ def _administrative(calibration: JSON, stated: Certificate, row: JSON) -> JSON:
             "endPerformanceDate": stated.performed.end or begin,
             "performanceLocation": stated.place,
             "issueDate": stated.issued,
+            "nextDate": stated.next_date,
         },
         "items": [
             {
@@ -132,6 +147,8 @@ def _administrative(calibration: JSON, stated: Certificate, row: JSON) -> JSON:
             "sampling": stated.sampling,
             "externalResults": stated.external_results,
             "opinions": stated.opinions,
+            "adjustment": f"Adjusted: {stated.adjusted}." if stated.adjusted else NOT_ADJUSTED,
+            "reproduction": REPRODUCTION,
             "software": SOFTWARE_SAYS,
         },
     }
@@ -166,7 +183,12 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: Settings, 
             "accuracy of local gravity, g": table.gravity_accuracy_g,
             "laboratory": stated.environment,
         },
+        "suppliedByOthers": _supplied(calibration, sensor, held_out),
         "results": _quantities(part),
+        "relations": [
+            {"entry": entry, "name": p.name, "value": p.value, "unit": p.unit, "uncertainty": p.expanded_uncertainty}
+            for entry, p in _relations(part)
+        ],
         "frame": frame_words(part) or None,
         "notInUncertainty": [f"{source}: {reason}" for source, reason in beyond_uncertainty(part)],
         "beyondLimits": part.get("beyond_limits") or [],
@@ -181,6 +203,35 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: Settings, 
             "pass": held_out.get("pass"),
         },
     }
+
+
+def model_state(held_out: JSON | None, found: JSON | None) -> JSON:
+    """Return which effects of a sensor are not modelled, its verdict and its error over noise, and a sentence of it."""
+    verdict, error = (found or {}).get("verdict"), error_of(held_out)
+    missing = [plain(name) for name in (found or {}).get("selected") or []] * (verdict == Verdict.MISSING_EFFECT)
+    said = f"not modelled: {', '.join(missing)}" if missing else KINDS[verdict].meaning if verdict in KINDS else ""
+    if verdict == Verdict.NOTHING_MISSING:
+        said = "complete as far as the recordings show"
+    ratio = f"error of the {error.kind} {number(error.ratio)} × noise" if error.ratio else ""
+    sentence = "; ".join(filter(None, [said or "not diagnosed", ratio]))
+    return {"verdict": verdict, "notModelled": missing, "errorOverNoise": error.ratio, "sentence": sentence}
+
+
+def _supplied(calibration: JSON, sensor: str, held_out: JSON) -> str:
+    """Return the data that neither the recordings nor the laboratory determined (ISO/IEC 17025, 7.8.2.2)."""
+    names = {"source": "white noise", "wander_source": "bias wander", "correlation_time_source": "its correlation time"}
+    noise = [words for key, words in names.items() if (held_out.get("noise") or {}).get(key) == "data_sheet"]
+    given = ", ".join([*noise, "limits of parameters and effects"])
+    return f"sensor file {calibration.get('sensor')}, by the manufacturer's data sheet, {sensor}: {given}"
+
+
+def _relations(part: JSON) -> Iterator[tuple[str, Parameter]]:
+    """Yield each entry of the matrix with the element of K, its inverse, that has the same indices."""
+    found = {p.name: p for p in reading_errors(part)}
+    for row in AXES:
+        for column in AXES:
+            name = f"scale_factor_error_{row}" if row == column else f"cross_axis_{row}{column}"
+            yield f"matrix_{row}{column}", found[name]
 
 
 def _quantities(part: JSON) -> list[JSON]:
@@ -320,7 +371,7 @@ def _tables(result: JSON) -> list[JSON]:
     assert known is not None  # noqa: S101  (g or deg/s)
     factor, unit = known
     tables = []
-    for name, key in (("before", "beforeAdjustment"), ("after", "afterAdjustment")):
+    for name, key in (("as found, before", "beforeAdjustment"), ("as left, after", "afterAdjustment")):
         errors = {n: e * factor for n, e in (result[key] or {}).items() if e is not None}
         columns = [{"name": n, "values": [e], "unit": unit} for n, e in errors.items()]
         tables += [{"name": f"error on held-out motion {name} the calibration is applied", "columns": columns}]
@@ -331,4 +382,6 @@ def _tables(result: JSON) -> list[JSON]:
         for key, words in (("mean_error", "mean residual"), ("rms_error", "rms residual")):
             columns.append({"name": words, "values": [b[key] * factor for b in swept["bins"]], "unit": unit})
         tables.append({"name": f"residual over temperature, {swept['samples_of']}", "columns": columns})
+    elements = [{"name": r["name"], "values": [r["value"]], "unit": "\\one"} for r in result["relations"]]
+    tables.append({"name": "elements of the inverse of the matrix", "columns": elements})
     return [t for t in tables if t["columns"]]

@@ -1,12 +1,16 @@
 """The Digital Calibration Certificate has the structure of DCC 3.2.1 and says what the report says."""
 
 import copy
+import html
+import json
+import re
 from typing import Any
 from xml.etree import ElementTree as ET
 
+import numpy as np
 import pytest
 
-from pipeline.report.certificate import certificate, digital_certificate, dsi_unit, missing_for_dcc
+from pipeline.report.certificate import certificate, certificate_page, digital_certificate, dsi_unit, missing_for_dcc
 from pipeline.settings import Certificate
 
 from .conftest import Unit, build_unit
@@ -78,15 +82,24 @@ SWEPT = {
 
 
 @pytest.fixture(scope="module")
-def report() -> dict[str, Any]:
-    unit: Unit = build_unit()
+def unit() -> Unit:
+    made: Unit = build_unit()
     for sensor in ("accelerometer", "gyroscope"):
-        unit.calibration[sensor]["uncertainty_budget"] = BUDGET
-        unit.validation[sensor]["over_temperature"] = SWEPT
+        made.calibration[sensor]["uncertainty_budget"] = BUDGET
+        made.validation[sensor]["over_temperature"] = SWEPT
+    return made
+
+
+@pytest.fixture(scope="module")
+def report(unit: Unit) -> dict[str, Any]:
+    return report_of(unit, {})
+
+
+def report_of(unit: Unit, more: dict[str, Any]) -> dict[str, Any]:
     stated = STATED | {"country": "DE", "item": {"description": "IMU <&> board", "manufacturer": "I"}}
-    stated |= {"number": " S1-7 ", "authorised_by": {"name": "A. Person", "role": "head"}}
+    stated |= {"number": " S1-7 ", "authorised_by": {"name": "A. Person", "role": "head"}} | more
     Certificate.model_validate(stated)
-    return certificate(unit.calibration, unit.validation, settings_of(unit, stated), "25.0 to 29.0")
+    return certificate(unit.calibration, unit.validation, settings_of(unit, stated), "25.0 to 29.0", unit.diagnosis)
 
 
 def tag(element: ET.Element) -> str:
@@ -170,3 +183,40 @@ def test_a_unit_in_the_notation_of_d_si(unit: str, factor: float, dsi: str) -> N
 
 def test_a_unit_that_d_si_does_not_know_is_not_guessed() -> None:
     assert dsi_unit("furlong/s") is None
+
+
+def test_html_json_and_xml_state_the_same_items_of_the_standard(unit: Unit) -> None:
+    """ISO/IEC 17025:2017, 7.8.2.1, 7.8.2.2, 7.8.4.1 and 7.8.4.3."""
+    report = report_of(unit, {"next_date": "2027-02-03", "adjusted": None})
+    xml, page = digital_certificate("U1", report), certificate_page("U1", report)
+    assert xml is not None
+    kinds = [json.dumps(report, ensure_ascii=False), xml, html.unescape(page)]
+    (ratio,) = re.findall(r"error of the \w+ ([\d.]+) × noise", report["measurementResults"][0]["model"]["sentence"])
+    for words in (
+        f"not modelled: quadratic nonlinearity; error of the vector {ratio} × noise",
+        "Nothing was adjusted in the item: as found are its readings, as left",
+        "reproduced in full only",
+        "2027-02-03",
+        "accelerometer: limits of parameters and effects",
+    ):
+        assert [words in text for text in kinds] == [True] * 3, words
+    first = report["measurementResults"][0]
+    assert first["model"]["errorOverNoise"] == pytest.approx(float(ratio), rel=5e-3)
+    K = np.linalg.inv(np.array(unit.calibration["accelerometer"]["matrix"]))
+    relations = {r["entry"]: r["value"] for r in first["relations"]}
+    assert relations["matrix_xy"] == pytest.approx(K[0, 1])
+    assert relations["matrix_zz"] == pytest.approx(K[2, 2] - 1.0)
+    assert "scale factor error z 0.0515" in page
+    assert "scale_factor_error_z" in xml
+    assert 'class="signature">Signature of A. Person' in page
+    assert ">1</td>" in page  # the unit of the matrix
+    adjusted = report_of(unit, {"adjusted": "range set to 4 g"})
+    assert "Adjusted: range set to 4 g." in certificate_page("U1", adjusted)
+    assert "Next calibration" not in certificate_page("U1", adjusted)
+
+
+def test_a_report_with_references_does_not_say_that_it_has_none(unit: Unit) -> None:
+    for stated, said in ((STATED["equipment"], False), ([], True)):
+        report = report_of(unit, {"equipment": stated})
+        assert ("no certificate stated" in certificate_page("U1", report)) is said
+        assert ("K-113" in certificate_page("U1", report)) is not said or not stated
