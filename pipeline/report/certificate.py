@@ -44,8 +44,6 @@ COVERAGE = (
 )
 REPRODUCTION = "This report may be reproduced in full only, unless the laboratory approves otherwise."
 NOT_ADJUSTED = "Nothing was adjusted in the item: as found are its readings, as left those with this calibration."
-    "Nothing was adjusted in the item: as found are its readings, as left its readings with this calibration."
-)
 SOFTWARE_SAYS = "Accreditation and traceability are the laboratory's statements; the software asserts neither."
 DAY = re.compile(r"\d{4}-\d{2}-\d{2}")
 ERRORS = ("rms_error", "mean_abs_error", "max_error", "min_error", "vector_rms_error")
