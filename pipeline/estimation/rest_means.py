@@ -18,7 +18,7 @@ from pipeline.estimation.turns import stop_and_go
 from pipeline.model.kinematics import table_motion
 from pipeline.records import once
 from pipeline.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
-from pipeline.signal.quiet_motion import creep_of_rest, posterior_creep_rates
+from pipeline.signal.quiet_motion import coarse_of, creep_of_rest, posterior_creep_rates, step_and_noise
 from pipeline.signal.rests import Rest, find_rests, rests_from_table, usable
 
 if TYPE_CHECKING:
@@ -168,6 +168,7 @@ class Rests:
     recording: Index  # (m,); index of the recording that each belongs to
     held_out: Mask  # (m,)
     span: Index  # (m, 2); its first sample, and the one after its last
+    step: Values  # (m, 3), g or deg/s; of the readings on an axis whose noise is below half a step, else 0
     # (m, 3), deg/s; rate across gravity at which the unit tilts, by the readings of the accelerometer; 0 where it
     # stands still
     creep: Values
@@ -179,6 +180,13 @@ class Rests:
         """Return some of the rests."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "clock_shared"}
         return replace(self, **{name: values[index] for name, values in arrays.items()})
+
+    def variance(self, white: Values) -> Values:
+        """Return the variance of each mean by white noise, (3,), of a sample and by coarse steps: (m, 3) array.
+
+        In steps d that hide the noise a mean has the rounding error ``d / sqrt(12)``, however many readings it has.
+        """
+        return np.asarray(self.share[:, None] * white**2 + self.step**2 / 12.0)
 
     @property
     def white(self) -> Values:
@@ -231,11 +239,18 @@ def rests_of(
     return replace(found, held_out=np.array([key in held for key in keys], bool)) if len(found.time) else None
 
 
+@once
+def _step_and_noise(recording: Recording, sensor: str) -> tuple[Values, Values]:
+    return step_and_noise(np.asarray(recording.reading(sensor)))
+
+
 def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, Sequence[Rest]]) -> Rests:
     """Gather rests of some recordings, which ``chosen`` has by their index; none is held out."""
     parts = {index: _of_recording(recordings[index], sensor, tuple(rests)) for index, rests in chosen.items()}
     columns = {name: np.concatenate([part[name] for part in parts.values()]) for name in next(iter(parts.values()))}
     columns["recording"] = np.repeat([*parts], [len(part["time"]) for part in parts.values()])
+    step = coarse_of([_step_and_noise(r, sensor) for r in recordings if r.reading(sensor) is not None])
+    columns["step"] = np.tile(step, (len(columns["time"]), 1))
     shared = len(np.unique(columns["recording"])) == 1 or all(recordings[index].clock_shared for index in chosen)
     return Rests(**columns, clock_shared=shared)
 

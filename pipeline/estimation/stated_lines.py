@@ -1,7 +1,6 @@
 """Add the lines of a budget that do not depend on the method of the fit: temperature, repeatability, counted time.
 
-The rounding error of readings whose noise is below half a step is stated as not included.
-
+    quantisation  : db = d / sqrt(12) where the noise is below half a step d of the readings: no mean is better
     temperature   : u_T = sqrt(a^2 + R^2 / 12);  db = c_b u_T / sqrt(3),  dM = M c_k u_T / sqrt(3) by columns
     repeatability : db = r_b,  dM = M r_k by columns, each axis by itself
     bursts        : dM = M e of a gyroscope, e the relative uncertainty of the interval of samples that arrive in bursts
@@ -84,17 +83,14 @@ def with_stated(
             missing["temperature"] = warm
         else:
             lines += warm
-    missing |= _rounding(noise, calibration.sensor)
+    lines += _rounding(noise, calibration, filtered)
     lines += _counted_time(calibration, filtered, limits.get("clock_rate"))
     lines += _rate_off_angle(calibration, rate_error)
     lines += _of_bursts(calibration, filtered)
     known = {line.source.partition(" (")[0] for line in lines} | set(missing)
-    up_to: dict[str, dict[str, float]] = {}
     entries = [entry for entry in budget.not_included if entry.source not in known]
     not_included = [_bounded(entry, settings.table, limits.get("clock_rate")) for entry in entries]
-    if noise is not None and noise.step is not None:
-        up_to = {QUANTISATION: {"bias": 0.5 * float(noise.step.max())}}
-    not_included += [NotIncluded(source, reason, up_to.get(source, {})) for source, reason in missing.items()]
+    not_included += [NotIncluded(source, reason) for source, reason in missing.items()]
     covariance = before + np.sum([line.covariance for line in lines], axis=0) if lines else before
     old = calibration.parameters.degrees_of_freedom
     share = np.divide(np.diag(covariance), np.diag(before), out=np.ones(len(before)), where=np.diag(before) > 0.0)
@@ -104,15 +100,22 @@ def with_stated(
     return with_uncertainty(calibration, covariance, freedom, budget)
 
 
-def _rounding(noise: Noise | None, sensor: str) -> dict[str, str]:
-    """Return why the rounding error of a coarse log is not included; empty for other logs."""
-    if noise is None or noise.step is None:
-        return {}
-    reason = (
-        f"the readings have steps of {float(noise.step.max()):.3g} {SENSOR_UNITS[sensor]} and noise of less than "
-        "half a step, so that means are off by up to half a step, however long the recording: log more digits"
-    )
-    return {QUANTISATION: reason}
+def _rounding(
+    noise: Noise | None, calibration: SensorCalibration, recordings: Sequence[Recording]
+) -> list[Contribution]:
+    """Return the line of readings in steps that hide the noise; the gyroscope's fit to rests and moves contains it."""
+    by_moves = calibration.sensor == "gyroscope" and any(r.role == "rests" for r in recordings)
+    if (
+        noise is None
+        or noise.step is None
+        or by_moves
+        or any(line.source == QUANTISATION for line in calibration.lines)
+    ):
+        return []
+    largest, unit = float(noise.step.max()), SENSOR_UNITS[calibration.sensor]
+    effect = np.eye(len(calibration.parameters))[:, BIAS] * noise.step / largest
+    remark = f"readings in steps of up to {largest:.3g} {unit} with less noise than half a step: log more digits"
+    return [type_b(QUANTISATION, RECTANGULAR, largest / np.sqrt(12.0), unit, effect, remark)]
 
 
 def _counted_time(

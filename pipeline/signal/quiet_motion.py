@@ -220,18 +220,27 @@ def coarse_steps(readings: Sequence[Values]) -> Values:
     half a step; with less, the rounding error of a mean is the same however many readings it has. The noise is that of
     the quietest recording: the first quartile of the white noise of its blocks.
     """
-    steps, noise = [np.full(3, np.inf)], [np.full(3, np.inf)]
-    for values in readings:
-        differences = np.abs(np.diff(values[np.isfinite(values).all(axis=1)], axis=0))
-        count = len(differences) // DIFFERENCE_BLOCK
-        if count < MIN_DIFFERENCE_BLOCKS:
-            continue
-        step = counts_of(differences)
-        blocks = differences[: count * DIFFERENCE_BLOCK].reshape(count, DIFFERENCE_BLOCK, 3)
-        steps.append(np.where(step > 0.0, step, np.inf))
-        noise.append(np.sqrt(0.5 * np.percentile(np.mean(blocks**2, axis=1), 25.0, axis=0)))
-    step = np.min(steps, axis=0)
-    return np.asarray(np.where(np.isfinite(step) & (np.min(noise, axis=0) < COARSE * step), step, 0.0), np.float64)
+    return coarse_of([step_and_noise(values) for values in readings])
+
+
+def step_and_noise(values: Values) -> tuple[Values, Values]:
+    """Return the step and the noise of each axis of a recording's (n, 3) readings; infinite where unknown."""
+    unknown = np.full(3, np.inf)
+    differences = np.abs(np.diff(values[np.isfinite(values).all(axis=1)], axis=0))
+    count = len(differences) // DIFFERENCE_BLOCK
+    if count < MIN_DIFFERENCE_BLOCKS:
+        return unknown, unknown
+    step = counts_of(differences)
+    blocks = differences[: count * DIFFERENCE_BLOCK].reshape(count, DIFFERENCE_BLOCK, 3)
+    noise = np.sqrt(0.5 * np.percentile(np.mean(blocks**2, axis=1), 25.0, axis=0))
+    return np.where(step > 0.0, step, np.inf), noise
+
+
+def coarse_of(found: Sequence[tuple[Values, Values]]) -> Values:
+    """Return ``coarse_steps`` of recordings by the ``step_and_noise`` of each."""
+    unknown = np.full(3, np.inf), np.full(3, np.inf)
+    step, noise = (np.min(values, axis=0) for values in zip(unknown, *found, strict=True))
+    return np.asarray(np.where(np.isfinite(step) & (noise < COARSE * step), step, 0.0), np.float64)
 
 
 def windows(values: Values, size: int) -> tuple[Values, Values]:

@@ -68,15 +68,18 @@ def test_what_is_not_stated_is_named_with_the_key_that_states_it(fitted: Any) ->
     assert np.array_equal(found.covariance, fitted[0].covariance)
 
 
-def test_the_rounding_of_a_coarse_log_is_stated_as_not_included(fitted: Any) -> None:
+def test_no_bias_of_a_coarse_log_is_better_than_its_rounding(fitted: Any) -> None:
     calibration, warm = fitted[0], fitted[1].filtered
-    noise = Noise(np.full(3, 0.3), np.zeros(3), 100.0, "static", step=np.array([0.5, 0.0, 1.0]))
-    part = with_stated(calibration, known(warm, noise), sheet()).to_json()
-    (entry,) = [e for e in part["uncertainty_budget"]["not_included"] if e["source"] == "quantisation"]
-    assert (entry["up_to"], "steps of 1 deg/s" in entry["reason"]) == ({"bias": 0.5}, True)
-    assert "quantisation, up to 0.5 deg/s of bias" in dict(beyond_uncertainty(part))
-    fine = with_stated(calibration, known(warm, replace(noise, step=None)), sheet()).to_json()
-    assert not any("quantisation" in source for source, _ in beyond_uncertainty(fine))
+    step = np.array([0.5, 0.0, 1.0])
+    noise = Noise(np.full(3, 0.3), np.zeros(3), 100.0, "static", step=step)
+    found = with_stated(calibration, known(warm, noise), sheet())
+    was, u = (np.sqrt(np.diag(c.covariance))[:3] for c in (calibration, found))
+    assert u == pytest.approx(np.hypot(was, step / np.sqrt(12.0)))
+    budget = found.to_json()["uncertainty_budget"]
+    assert "quantisation" in [line["source"] for line in budget["contributions"]]
+    assert "quantisation" not in [entry["source"] for entry in budget["not_included"]]
+    fine = with_stated(calibration, known(warm, replace(noise, step=None)), sheet())
+    assert np.sqrt(np.diag(fine.covariance))[:3] == pytest.approx(was)
 
 
 def test_repeatability_adds_in_quadrature_and_has_infinite_degrees_of_freedom(fitted: Any) -> None:

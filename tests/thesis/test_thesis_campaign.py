@@ -72,7 +72,7 @@ def test_the_printed_figures_are_those_of_the_thesis() -> None:
         [0.069, 0.032]
     ]
     files = ("accel_parameters", "gyro_parameters", "errors")
-    assert len({table for file in files for table in read_printed(PRINTED, file)["table"]}) == 22
+    assert len({table for file in files for table in read_printed(PRINTED, file).table}) == 22
     methods = read_printed(PRINTED, "method_comparison")
     assert methods[methods["method"] == "cholesky_lu"]["change_percent"].tolist() == [83.615, 78.859, 5.276]
 

@@ -8,7 +8,7 @@ where
     y   : (3,) mean reading of a rest, g; w s^2 its variance, s^2 that of a sample
     b, M: bias, g, and matrix ``M = Q L``: |f| determines the lower triangular L, but not the rotation Q, which is fixed
     z   : effects, at the force of the magnitude of gravity; p their parameters
-    s_e : standard deviation of |f| by white noise: ``s_e^2 = w sum_c (M^T n)_c^2 s_c^2``
+    s_e : standard deviation of |f|: ``s_e^2 = sum_c (M^T n)_c^2 (w s_c^2 + d_c^2 / 12)``, d coarse steps of readings
 
 If the procedure states faces, their equations are added (``faces_and_turns``), and the full matrix is fitted. Otherwise
 a misalignment that the rests do not determine has a separate equation, a pseudo-observation of 0 with the standard
@@ -91,7 +91,8 @@ class AccelerometerModel:
         length = np.linalg.norm(force, axis=1)
         n = force / length[:, None]
         along = n @ state.matrix
-        error = np.sqrt(rests.share * (along**2 @ self.white**2))
+        variance = rests.variance(self.white)
+        error = np.sqrt(np.sum(along**2 * variance, axis=1))
         target = np.sqrt(self.gravity**2 + 2.0 * rests.share * np.mean(self.white**2))
         motion = self._motion(self.gravity * n, rests)
         base = np.concatenate([-along, (n[:, :, None] * v[:, None, :]).reshape(-1, 9)], axis=1)
@@ -122,7 +123,7 @@ class AccelerometerModel:
             return stacked([of_rests, of_limits], self, state, candidates)
         W = self.faces.weights() / self.gravity
         WM = W @ state.matrix
-        wide = np.sqrt(self.faces.error**2 + np.einsum("rmc,m,c->r", WM**2, rests.share, self.white**2))
+        wide = np.sqrt(self.faces.error**2 + np.einsum("rmc,mc->r", WM**2, variance))
         by_matrix = np.einsum("rmi,mj->rij", W, v).reshape(-1, 9)
         of_faces = EquationBlock(
             -np.einsum("rmc,mc->r", W, force) / wide,

@@ -191,7 +191,7 @@ class GyroscopeModel:
     def _at_rest(self, state: State) -> EquationBlock:
         rests, K = self.rests, state.K
         residual, motion = self._rate_at_rest(rests, self.force, state)
-        error = np.sqrt(rests.share[:, None]) * self.white
+        error = np.sqrt(rests.variance(self.white))
         m = len(rests.time)
         base = np.zeros((m, 3, BASE_COUNT))
         base[:, :, BIAS] = np.eye(3) / error[:, :, None]
@@ -211,18 +211,20 @@ class GyroscopeModel:
             bias.reshape(3, 3 * m, m),
             (rests.start, rests.length, rests.recording),
             scattered=True,
-            common=self._of_creep(K, error),
+            common=self._of_rests(K, error),
         )
 
-    def _of_creep(self, K: Values, error: Values) -> Values | None:
-        """Return the covariance of the rests' equations by the uncertainty of their creep: (3 m, 3 m) array."""
-        across, about = self.rests.creep_error, self.rests.creep_about
-        if not about.any():
+    def _of_rests(self, K: Values, error: Values) -> Values | None:
+        """Return the covariance of the rests' equations by creep, and by rounding that all rests share: (3 m, 3 m)."""
+        across, about, step = self.rests.creep_error, self.rests.creep_about, self.rests.step
+        if not about.any() and not step.any():
             return None
+        rounding = np.einsum("ic,jd,cd->icjd", step / error, step / error, np.eye(3) / 12.0).reshape(error.size, -1)
         u = self.force / np.linalg.norm(self.force, axis=1, keepdims=True)
         upward = u[:, :, None] * u[:, None, :]
         rate = across[:, None, None] ** 2 * (np.eye(3) - upward) + about[:, None, None] ** 2 * upward
-        return scipy.linalg.block_diag(*(K @ rate @ K.T / error[:, :, None] / error[:, None, :]))
+        creep = scipy.linalg.block_diag(*(K @ rate @ K.T / error[:, :, None] / error[:, None, :]))
+        return np.asarray(creep + rounding)
 
     def _of_moves(self, state: State) -> EquationBlock:
         moves, gravity = self.moves, self.at_rests

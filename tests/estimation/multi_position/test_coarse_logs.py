@@ -1,0 +1,32 @@
+"""Readings in steps that hide their noise: errors stay within U."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ferraris_session import FITS
+from unit_settings import settings_of, with_noise
+
+from pipeline.estimation.stated_lines import with_stated
+from pipeline.records import BIAS, base_values
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription
+
+SETTINGS = settings_of(sensor="mpu6050", table="hand", procedure="multi_position")
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("sensor", "step"), [("gyroscope", 0.125), ("gyroscope", 0.5), ("accelerometer", 0.01)])
+def test_the_bias_is_within_an_uncertainty_that_holds_the_rounding(sensor: str, step: float, seed: int) -> None:
+    unit = UnitDescription("U", sensor="mpu6050", table="hand", procedure="multi_position", interval_s=0.02)
+    recordings, truth = simulate_unit(unit, seed, 0)
+    coarse = [replace(r, **{sensor: step * np.round(r.reading(sensor) / step)}) for r in recordings]
+    with_noises = with_noise(coarse, SETTINGS)
+    found = with_stated(FITS[sensor].fit(with_noises, None, SETTINGS), with_noises, SETTINGS)
+    U = found.parameters.expanded_uncertainty[BIAS]
+    error = base_values(found.bias, found.matrix)[BIAS] - truth[sensor]["bias"]
+    assert np.all(np.abs(error) < 2.0 * U)
+    if sensor == "accelerometer":  # the gyroscope's moves cross the steps, and determine its bias better than its rests
+        assert np.all(step / np.sqrt(12.0) < U)
