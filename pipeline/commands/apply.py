@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from imu_logs.files import MESSAGE_FORMATS
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.field_logs.compensate import LogProfile, compensate_log, require_apart
+from pipeline.field_logs.compensate import compensate_log, require_apart
+from pipeline.field_logs.stream import LogProfile
 from pipeline.files import CONFIGS
 from pipeline.model.calibration_file import read_calibration
 from pipeline.model.compensation import SMOOTHING_S, load

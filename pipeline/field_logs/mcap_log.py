@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from imu_logs.mcap_file import ChannelMessages
     from imu_logs.message_decoder import TopicDecoder
     from imu_logs.profile import McapFormat
-    from pipeline.field_logs.compensate import LogProfile, LogStream, Output, Result
+    from pipeline.field_logs.stream import LogProfile, LogStream, Output, Result
     from pipeline.records import Integers, Values
 
 

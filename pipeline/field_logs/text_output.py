@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from imu_logs.text_lines import Head
-    from pipeline.field_logs.compensate import LogProfile, LogStream, Output, Readings, Result
+    from pipeline.field_logs.stream import LogProfile, LogStream, Output, Readings, Result
     from pipeline.records import Integers, Values
     from pipeline.settings import Ingest
 

@@ -12,7 +12,8 @@ from unit_settings import ingest_of
 
 from pipeline.commands.apply import main
 from pipeline.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
-from pipeline.field_logs.compensate import LogProfile, compensate_log
+from pipeline.field_logs.compensate import compensate_log
+from pipeline.field_logs.stream import LogProfile
 from pipeline.model.compensation import load
 from pipeline.records import FittedEffect, SensorCalibration
 

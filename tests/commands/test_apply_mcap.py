@@ -20,7 +20,8 @@ from imu_logs.mcap_write import DEFINITIONS, IMU, TEMPERATURE
 from pipeline.commands.apply import main
 from pipeline.errors import InputError
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.field_logs.compensate import LogProfile, compensate_log
+from pipeline.field_logs.compensate import compensate_log
+from pipeline.field_logs.stream import LogProfile
 from pipeline.model.compensation import load
 from pipeline.records import SENSORS, FittedEffect, Recording, SensorCalibration
 

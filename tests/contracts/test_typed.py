@@ -21,7 +21,7 @@ TAKE_JSON = {
         "commands/config.py", "config/", "model/effects/", "model/sensor_file.py", "settings.py", "simulation/",
     ),
     "documents of a run: written, read, and shown on pages, by commands and in formats of other programs": (
-        "commands/explain.py", "commands/noise.py", "diagnosis/words.py", "exports/", "field_logs/compensate.py",
+        "commands/explain.py", "commands/noise.py", "diagnosis/words.py", "exports/", "field_logs/stream.py",
         "history.py", "io/arrow.py", "io/axis_maps.py", "io/digests.py", "model/calibration_file.py",
         "model/compensation.py", "model/open_effects.py", "outcome.py", "planning/plan.py", "records/", "report/",
         "result.py", "results_folder.py", "stages/", "study/result.py", "thesis/page.py", "verdicts.py",

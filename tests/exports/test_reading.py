@@ -17,7 +17,7 @@ from pipeline.errors import ConfigurationError, InputError
 from pipeline.exports import formats
 from pipeline.exports.conversion import SAMPLE, explain_calibration
 from pipeline.exports.reading import read_any
-from pipeline.field_logs.compensate import LogProfile
+from pipeline.field_logs.stream import LogProfile
 from pipeline.records import SENSORS, SensorCalibration
 
 G0, RADIAN = 9.80665, np.pi / 180.0
