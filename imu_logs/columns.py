@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from imu_logs.errors import IngestError
-from imu_logs.profile import COMMENTED
-from imu_logs.units import BRACKETS, CHANNELS, SPELLINGS, TRIADS, UNITS, unit_in_brackets
+from imu_logs.profile import COMMENTED, DROP, GAP
+from imu_logs.units import BRACKETS, CHANNELS, GYROSCOPE, SPELLINGS, TRIADS, UNITS, unit_in_brackets
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,7 +41,28 @@ SENSOR_WORDS = {
         "g", "gy", "gyr", "gyro", "gyroscope", "w", "om", "omega", "rotation", "rot", "angular", "rate", "rates",
     },
 }  # fmt: skip
-NO_SENSOR = {"mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias"}
+# Words of columns that hold no readings: other sensors, estimates, and acceleration without gravity.
+NO_SENSOR = {
+    "mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias", "free",
+    "transform", "transforms", "orientation", "quaternion", "quat", "euler", "pose", "position",
+}  # fmt: skip
+COUNTER_WORDS = {
+    "counter",
+    "count",
+    "number",
+    "packet",
+    "packets",
+    "seq",
+    "sequence",
+    "sample",
+    "samples",
+    "index",
+    "frame",
+}
+BODY_RATES = ("p", "q", "r")  # about x, y and z, in aeronautics (ISO 1151-1)
+COMMENTS = ("#", "%", "//")  # starts of lines that are no data
+NOT_FINITE = ("", "nan", "-nan", "inf", "-inf", "+inf", "null", "none")  # cells without a number
+MAX_BAD_ROWS = 0.01  # of the rows; a column with more of other text is no column of numbers
 TIME_FIRST = {
     "t", "ts", "sec", "secs", "ms", "us", "ns", "msec", "usec", "nsec", "tow", "utc", "epoch", "elapsed", "date",
     "uhrzeit",
@@ -60,7 +81,8 @@ TABLE_CHANNEL_WORDS = {
 SQUARED = (["s"], ["ms"], ["mps"])  # words before a 2 that is an exponent, not an axis
 UNIT_ENDINGS = (
     ("m/s^2", ("m s 2", "mps 2", "ms 2")), ("deg/s", ("dps", "deg s", "degps")),
-    ("rad/s", ("rad s", "rads", "radps", "rad")), ("degC", ("degc", "deg c", "c")), ("mg", ("mg",)), ("g", ("g",)),
+    ("mdps", ("mdps", "mdeg s")), ("rad/s", ("rad s", "rads", "radps", "rad")), ("degC", ("degc", "deg c", "c")),
+    ("mg", ("mg",)), ("ug", ("ug",)), ("g", ("g",)),
     ("s", ("s", "sec", "seconds")), ("ms", ("ms", "millis", "msec", "milliseconds")),
     ("us", ("us", "micros", "usec", "microseconds")), ("ns", ("ns", "nanos", "nsec", "nanoseconds")), ("deg", ("deg",)),
 )  # fmt: skip
@@ -175,6 +197,9 @@ def _triads_by_one_letter(log: UnknownLog) -> dict[str, Triad]:
         for at in (i for i, letter in enumerate(name) if letter in "xyz"):
             groups.setdefault((name[:at], name[at + 1 :]), {})[name[at]] = index
     triads: dict[str, Triad] = {}
+    single = {words_of(log.names[i])[0]: i for i in log.numbers if log.named and len(words_of(log.names[i])) == 1}
+    if set(BODY_RATES) <= single.keys() and any(stated_unit(log.names[single[n]], GYROSCOPE[0])[0] for n in BODY_RATES):
+        triads["gyroscope"] = (single["p"], single["q"], single["r"])
     for (before, after), axes in groups.items():
         adjacent = {*re.findall("[a-z]+$", before), *re.findall("^[a-z]+", after)}
         for sensor, sensor_words in SENSOR_WORDS.items():
@@ -218,6 +243,8 @@ def _find_time(columns: Columns, words: dict[int, list[str]]) -> None:
     named = [i for i, w in of_sensor.items() if w[0] in TIME_FIRST or set(w) & TIME_WORDS]
     of_arrays = [i for i, v in numbers.items() if columns.log.arrays and _never_falls(v)]
     first = [i for i in of_arrays if columns.log.names[i].partition(" [")[0].endswith("[0]")]
+    counting = {i for i, w in of_sensor.items() if set(w) & COUNTER_WORDS and not set(w) & TIME_WORDS}
+    counters += [i for i in rising if i in counting and i not in counters]
     unnamed = [i for i in sorted({*rising, *first}) if i not in counters and (not columns.log.named or i in of_sensor)]
     alike = all(np.array_equal(numbers[i], numbers[unnamed[0]]) for i in unnamed[1:])  # of each array of a recording
     unnamed = unnamed if not columns.log.named or (unnamed and alike) else []
@@ -353,6 +380,8 @@ def find_layout(data: bytes, path: str) -> UnknownLog:
     names, skip, comment = _names(lines, start, separator)
     parsed = lines[start : start + MAX_PARSED_ROWS]
     rows = [cells for cells in _cells(parsed, separator) if len(cells) == len(names)]
+    bad = _bad_rows(rows, decimal)
+    rows = [cells for i, cells in enumerate(rows) if i not in bad]
     numbers = _numbers(rows, decimal)
     if width < MIN_COLUMNS or len(rows) < MIN_ROWS or not numbers:
         first = " / ".join(lines[:3])[:150]
@@ -360,7 +389,7 @@ def find_layout(data: bytes, path: str) -> UnknownLog:
     stated = ((STATED_NUMBER.search(line), line.strip()) for line in lines[:start] if RATE_KEY.search(line))
     rates = ((float(match.group(1)), line) for match, line in stated if match)
     rate_hz, rate_line = next((rate for rate in rates if rate[0]), (None, ""))
-    named, odd = names != _numbered(len(names)), len(parsed) - len(rows)
+    named, odd = names != _numbered(len(names)), len(parsed) - len(rows) - len(bad)
     csv_section = {
         "delimiter": "whitespace" if separator == " " else separator,
         "decimal": decimal,
@@ -372,6 +401,11 @@ def find_layout(data: bytes, path: str) -> UnknownLog:
     evidence = {"rate_hz": f"the file states {rate_line!r}"} if rate_hz is not None else {}
     texts = {i: cells for i, cells in enumerate(zip(*rows, strict=True)) if i not in numbers}
     remarks = [f"{odd} rows have another number of fields than the others"] if odd else []
+    if bad:
+        kinds = {"nan": GAP} if all(bad.values()) else {"bad_rows": DROP, **({"nan": GAP} if any(bad.values()) else {})}
+        csv_section |= kinds
+        what = f"{len(bad)} of {len(bad) + len(rows)} rows hold a cell that is no number: each is left out, and noted"
+        evidence |= dict.fromkeys(kinds, what)
     return UnknownLog(
         path, csv_section, [*(names if named else range(len(names)))], names, numbers, evidence, remarks, texts
     )
@@ -402,11 +436,27 @@ def _try(lines: list[str], separator: str, decimal: str) -> tuple[int, int, str,
 def _names(lines: list[str], start: int, separator: str) -> tuple[list[str], int, str | None]:
     """Return the names of the columns, the number of lines before them, and the start of comments."""
     width = len(_cells([lines[start]], separator)[0]) if lines else 0
-    comment = "#" if start and lines[start - 1].lstrip().startswith("#") else None
-    above = _cells([lines[start - 1].lstrip().lstrip("#")], separator) if start else []
-    if above and len(above[0]) == width and not any(NUMBER["."].fullmatch(c.strip()) for c in above[0]):
-        return [c.strip() for c in above[0]], start - 1, comment
+    line = lines[start - 1].lstrip() if start else ""
+    comment = next((mark for mark in COMMENTS if line.startswith(mark)), None)
+    above = _cells([line.removeprefix(comment or "").lstrip(comment or "")], separator) if start else []
+    names = [c.strip() for c in above[0]] if above else []
+    if len(names) == width - 1 and not _cells([lines[start]], separator)[0][-1].strip():
+        names.append("")  # the rows end in a separator
+    if len(names) == width + 1 and not names[-1]:
+        names.pop()  # the header does
+    if len(names) == width and not any(NUMBER["."].fullmatch(name) for name in names):
+        return names, start - 1, comment
     return _numbered(width), start, comment
+
+
+def _bad_rows(rows: list[list[str]], decimal: str) -> dict[int, bool]:
+    """Return the few rows with a cell that is no number where other rows have one, and whether it is empty or NaN."""
+    bad: dict[int, bool] = {}
+    for cells in zip(*rows, strict=True):
+        others = [i for i, cell in enumerate(cells) if not NUMBER[decimal].fullmatch(cell.strip())]
+        if len(others) <= MAX_BAD_ROWS * len(rows):
+            bad |= {i: cells[i].strip().lower() in NOT_FINITE and bad.get(i, True) for i in others}
+    return bad
 
 
 def _numbers(rows: list[list[str]], decimal: str) -> dict[int, Values]:

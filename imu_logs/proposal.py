@@ -34,7 +34,7 @@ from imu_logs.guesses import (
 )
 from imu_logs.profile import AUTO, Profile
 from imu_logs.text_read import SHORTEST_PART
-from imu_logs.units import COUNTS, GYROSCOPE, TABLE_CHANNELS, TRIADS, UNITS
+from imu_logs.units import COUNTS, FORCE_UNITS, GYROSCOPE, TABLE_CHANNELS, TRIADS, UNITS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -44,9 +44,14 @@ if TYPE_CHECKING:
     from imu_logs.log import Values
 
 
-UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}
+UNITS_OF = {"accelerometer": ("g", "mg", "ug", "m/s^2"), "gyroscope": ("deg/s", "mdps", "rad/s")}
+LEAST_GRAVITY = 0.3  # of gravity, for the median |a| of a log; quality_flags refuses less
 FEWEST_LABELS, MOST_LABELS = 3, 4  # two texts may be states of the logger; labels that a remark names
 SEARCHED_BYTES = 1 << 25  # of a text log, for its layout
+# Topics of autopilots (PX4 uORB, ArduPilot log messages) to the shipped profiles.
+SHIPPED = {
+    "sensor_combined": "px4_ulog", "sensor_accel": "px4_raw", "sensor_gyro": "px4_raw", "IMU": "ardupilot",
+}  # fmt: skip
 Entries = dict[str, dict[str, Any]]
 
 
@@ -210,6 +215,8 @@ def _proposal(parts: list[Columns], evidence: Evidence) -> Proposal:
         _others(columns, entries, proposal, evidence.sensor)
         proposal.remarks += columns.remarks
         proposal.remarks += columns.log.remarks + _labels(columns.log)
+    if shipped := SHIPPED.get((first.topic or "").partition("[")[0]):
+        proposal.remarks.append(f"the profile {shipped} is shipped and reads such logs: name it instead")
     if force is not None or rate is not None:
         return proposal
     proposal.remarks.append("no three columns have the names or values of an accelerometer or a gyroscope")
@@ -329,14 +336,31 @@ def _add(sensor: str, parts: list[Columns], proposal: Proposal, guess: Guess) ->
     place = next(i for i, c in enumerate(parts) if sensor in c.triads)
     log, triad = parts[place].log, parts[place].triads[sensor]
     proposal.evidence[sensor] = guess.evidence
-    for channel, index in zip(TRIADS[sensor], triad, strict=True):
-        stated, why = stated_unit(log.names[index], channel) if log.named else (None, "")
+    axes = zip(TRIADS[sensor], triad, strict=True)
+    said = [stated_unit(log.names[index], channel) if log.named else (None, "") for channel, index in axes]
+    units = {unit for unit, _ in said if unit}
+    if len(units) == 1:  # of one axis alone: wx(rad/s), wy, wz
+        said = [next(entry for entry in said if entry[0])] * len(said)
+    if sensor == "accelerometer" and (without := _without_gravity(log, triad, said[0][0])):
+        proposal.remarks.append(without)
+    for channel, index, (stated, why) in zip(TRIADS[sensor], triad, said, strict=True):
         entry = {"unit": stated} if stated in UNITS_OF[sensor] else guess.entry
         proposal.columns[place][channel] = {"column": log.keys[index], **entry}
         if entry is not guess.entry:
             proposal.evidence[sensor] = f"{why}; {guess.evidence}"
             if guess.entry["unit"] not in (stated, TO_DECIDE):
                 proposal.remarks.append(f"{log.names[index]}: {why}, and yet {guess.evidence}")
+
+
+def _without_gravity(log: UnknownLog, triad: tuple[int, int, int], unit: str | None) -> str:
+    """Return a remark if the accelerometer reads far less than gravity; empty for none."""
+    size = float(np.median(np.linalg.norm([log.numbers[i] for i in triad], axis=0)))
+    if unit not in FORCE_UNITS or size > LEAST_GRAVITY * FORCE_UNITS[unit]:
+        return ""
+    return (
+        f"|a| is {size:.3g} {unit} on the whole: acceleration without gravity, which calibrates nothing; take the columns "
+        "or the file with gravity (TotalAcceleration beside Accelerometer, Acc beside FreeAcc)"
+    )
 
 
 def _others(columns: Columns, entries: Entries, proposal: Proposal, sensor: str) -> None:

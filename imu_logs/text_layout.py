@@ -101,7 +101,7 @@ def column_notes(names: list[str], columns: list[tuple[Column, int]], line: int)
     detail = f"axes are in the order {', '.join(listed)} and were assigned by their names"
     notes = [Note("N-ORDER", len(listed), line, line, detail)] if turned else []
     used = {index for _, index in columns}
-    ignored = [n for i, n in enumerate(names) if i not in used]
+    ignored = [n for i, n in enumerate(names) if n and i not in used]
     detail = f"columns not used: {', '.join(ignored)}"
     return notes + ([Note("N-IGNORED", len(ignored), line, line, detail)] if ignored else [])
 

@@ -159,8 +159,21 @@ class TextLog:
         names = [name.strip() for name in next(csv.reader([shown], delimiter=delimiter, skipinitialspace=True), [])]
         if header is None:
             names = [f"column {i}" for i in range(len(names))]
+        if header is not None:
+            self._fit_names(names, text, start, delimiter)
         self.head = Head(lines, header, names, delimiter, number)
         return start
+
+    def _fit_names(self, names: list[str], text: bytes, start: int, delimiter: str) -> None:
+        """Add or remove a last name without text, where the rows or the header alone end in a separator."""
+        end = text.find(b"\n", start)
+        if end < 0 or self._is_comment(text[start:end]):
+            return
+        cells = next(csv.reader([text[start:end].decode("utf-8", "replace")], delimiter=delimiter), [])
+        if len(cells) == len(names) + 1 and not cells[-1].strip():
+            names.append("")
+        elif len(cells) == len(names) - 1 and not names[-1]:
+            names.pop()
 
     def _rows(self, data: bytes, numbers: range) -> tuple[bytes, Integers]:
         """Remove comments and empty lines; return the other lines and their numbers."""

@@ -29,12 +29,12 @@ TABLE_CHANNELS = ("table_angle", "table_rate", *ATTITUDE)
 TRIADS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE}
 
 # Per quantity: unit to (multiplier, divisor); two numbers, because 1001.5 mg / 1000 is exact and times 0.001 is not.
-_FORCE = {"g": (1.0, 1.0), "mg": (1.0, 1000.0), "m/s^2": (1.0, STANDARD_GRAVITY), COUNTS: (1.0, 1.0)}
-_RATE = {"deg/s": (1.0, 1.0), "rad/s": (DEGREES, 1.0), COUNTS: (1.0, 1.0)}
+_FORCE = {"g": (1.0, 1.0), "mg": (1.0, 1000.0), "ug": (1.0, 1e6), "m/s^2": (1.0, STANDARD_GRAVITY), COUNTS: (1.0, 1.0)}
+_RATE = {"deg/s": (1.0, 1.0), "mdps": (1.0, 1000.0), "rad/s": (DEGREES, 1.0), COUNTS: (1.0, 1.0)}
 _ANGLE = {"deg": (1.0, 1.0), "rad": (DEGREES, 1.0), COUNTS: (1.0, 1.0)}
 _TEMPERATURE = {"degC": (1.0, 1.0), COUNTS: (1.0, 1.0)}
 _RATIO = {"1": (1.0, 1.0)}
-FORCE_UNITS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "mg": 1000.0}  # how many are one g
+FORCE_UNITS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "mg": 1000.0, "ug": 1e6}  # how many are one g
 _TIME = {"s": (1e9, 1.0), "ms": (1e6, 1.0), "us": (1e3, 1.0), "ns": (1.0, 1.0)}
 
 UNITS: dict[str, dict[str, tuple[float, float]]] = {
@@ -65,7 +65,8 @@ SPELLINGS = {
     "mps2": "m/s^2", "deg/s": "deg/s", "°/s": "deg/s", "dps": "deg/s", "degs/s": "deg/s", "rad/s": "rad/s",
     "rads/s": "rad/s", "s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us", "μs": "us", "ns": "ns",
     "deg": "deg", "°": "deg", "rad": "rad", "degc": "degC", "°c": "degC", "c": "degC", "celsius": "degC",
-    "counts": "counts", "lsb": "counts", "raw": "counts",
+    "counts": "counts", "lsb": "counts", "raw": "counts", "digit": "counts", "digits": "counts", "ug": "ug", "µg": "ug",
+    "μg": "ug", "mdps": "mdps", "mdeg/s": "mdps", "m°/s": "mdps",
 }  # fmt: skip
 BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 

@@ -9,6 +9,7 @@ encoder        : gravity turns with the table, f = c + a cos(2 pi n / N) + b sin
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,6 +32,8 @@ from imu_logs.guesses import (
     unit_of_turn,
 )
 from imu_logs.units import COUNTS, DEGREES, UNITS
+from imu_logs.yaml_file import read_yaml
+from pipeline.files import CONFIGS
 from pipeline.io.gravity_rotation import MoveByHand, interval_of, misfit_deg, moves_of, rests_of
 
 if TYPE_CHECKING:
@@ -49,6 +52,10 @@ USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)  # 2, 4, 8
 # 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch); whole mdps (drivers of STMicroelectronics).
 USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2, 1000.0)
 COUNT_GRID = np.geomspace(1.0, 1000.0, 481)  # grid of counts per deg/s, in steps of 1.4 %
+# A known factor is taken in place of the fitted one up to this misfit, or times that of the fitted one: a scale factor
+# that is off by 3 % (MPU-6050) turns gravity by 5 deg too much in half a turn.
+USUAL_FITS_DEG, USUAL_FITS = 5.0, 2.0
+SAME_FACTOR = 0.01  # relative: 131 and 131.2, as data sheets round 32768 / 250
 CONVINCING_DEG = 12.0  # below half of the residual angle of the next usual scale in a quarter turn
 FLATTEST = 0.1  # smallest over largest extent of rests in a plane: misalignment and scale factors are some percent
 FEWEST_RESTS_FOR_A_SPHERE = 9  # twice the four unknowns, and one
@@ -161,10 +168,23 @@ def slope(rate: Values, table: Values) -> float | None:
 
 def _usual_counts(measured: float, close: float) -> tuple[dict[str, Any], str]:
     """Return the entry of a gyroscope in counts, with the usual counts per deg/s if they are close, and a remark."""
-    usual = min(USUAL_COUNTS_PER_DPS, key=lambda c: abs(np.log(measured / c)))
+    known, usual = (
+        min(cs, key=lambda c: abs(np.log(measured / c))) for cs in (factors_of_sensors(), USUAL_COUNTS_PER_DPS)
+    )
+    usual = usual if abs(usual / known - 1) < SAME_FACTOR else known
     if abs(measured / usual - 1) < close:
         return {"unit": COUNTS, "counts_per_unit": usual}, f"; {usual:g} is the usual number near it"
     return {"unit": COUNTS, "counts_per_unit": float(f"{measured:.3g}")}, ""
+
+
+@cache
+def factors_of_sensors() -> tuple[float, ...]:
+    """Return the counts per deg/s of all ranges of the shipped sensors, and the usual ones."""
+    found = set(USUAL_COUNTS_PER_DPS)
+    for file in (CONFIGS / "sensor").glob("*.yaml"):
+        figures = read_yaml(file).get("gyroscope") or {}
+        found |= {float(counts) for counts in (figures.get("ranges") or {}).values() if counts}
+    return tuple(sorted(found))
 
 
 def _counts_per_dps(moves: Sequence[MoveByHand], otherwise: str, *, timed: bool) -> Guess:
@@ -182,6 +202,10 @@ def _counts_per_dps(moves: Sequence[MoveByHand], otherwise: str, *, timed: bool)
         listed = " or ".join(f"{c:g} at {product / c:.3g} Hz" for c in USUAL_COUNTS_PER_DPS if 50 < product / c < 1100)
         return Guess(unknown, f"counts_per_unit times the sampling rate in Hz is near {product:.3g} ({listed}), {seen}")
     entry, taken = _usual_counts(measured, CLOSE_BY_TURNS)
+    usual = entry["counts_per_unit"]
+    if taken and (missed := float(misfit_deg(moves, [1 / usual])[0])) > max(USUAL_FITS_DEG, USUAL_FITS * angle):
+        entry, taken = {"unit": COUNTS, "counts_per_unit": float(f"{measured:.3g}")}, ""
+        seen += f" (with the nearest factor of a known sensor, {usual:g}, to within {missed:.1f} deg)"
     return Guess(entry, f"counts, {measured:.3g} a deg/s, {seen}{taken}")
 
 

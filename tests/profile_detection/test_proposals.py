@@ -354,3 +354,20 @@ def test_an_encoder_that_starts_again_and_turns_about_one_axis_are_read_in_one_p
         assert found["accel_x"] == {"column": "ax", "unit": "counts", "counts_per_unit": 16384.0}
         assert found["table_angle"]["counts_per_unit"] == pytest.approx(turn / 360)
         assert found["gyro_z"]["counts_per_unit"] == 1000.0
+
+
+@pytest.mark.parametrize("counts", [57.1429, 114.2857, 131.0, 200.0])
+def test_factors_of_a_gyroscope_are_those_of_a_known_sensor_or_the_fitted_one(tmp_path: Path, counts: float) -> None:
+    data = motion() * [1, *[16384.0] * 3, *[counts] * 3]
+    file = tmp_path / "log.csv"
+    np.savetxt(
+        file,
+        np.column_stack([data[:, 0], np.rint(data[:, 1:])]),
+        "%.9g",
+        ",",
+        header="t,ax,ay,az,gx,gy,gz",
+        comments="",
+    )
+    found = proposed(file).columns[0]["gyro_x"]["counts_per_unit"]
+    assert found == pytest.approx(counts, rel=0.05)  # 200: of no sensor that is shipped
+    assert counts == 200.0 or found == counts
