@@ -24,7 +24,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from imu_logs.errors import ConfigurationError, IngestError, InputError, MissingInputError, UserError
-from imu_logs.files import MESSAGE_FORMATS
+from imu_logs.files import ZIP, is_message_log, text_members
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -99,7 +99,7 @@ def read(
     from imu_logs.profile import Profile, checks_of, csv_formats, load_profile  # noqa: PLC0415  (pydantic)
 
     known = profile if isinstance(profile, Profile) else load_profile(profile or CANONICAL_CSV)
-    if files[0].suffix.lower() in (".mcap", *MESSAGE_FORMATS):
+    if is_message_log(files[0]):
         from imu_logs.message_read import read_logs  # noqa: PLC0415  (slow import, not for text logs)
 
         return read_logs(files, known)
@@ -108,12 +108,26 @@ def read(
     if files[0].suffix == ".gcsv":
         return read_gcsv(files[0], checks_of(known))
     layouts = layouts or csv_formats(known)
+    if [file.suffix.lower() for file in files] == [ZIP] and files[0].is_file():
+        files = _in_zip(files[0], known)
     if len(files) != len(layouts):
         raise ConfigurationError(f"the profile reads a recording from {len(layouts)} files; got {len(files)}")
     if session is None:
         return read_csv(files, layouts, checks_of(known))
     log = read_csv(files, [f.model_copy(update={"session": session}) for f in layouts], checks_of(known))
     return replace(log, source={**log.source, "session": session})
+
+
+def _in_zip(archive: Path, profile: Profile) -> list[Path]:
+    """Return the text logs in a zip file that the profile names as parts, else the only one."""
+    members, parts = text_members(archive), [part["file"] for part in profile.csv.get("parts") or ()]
+    if parts:
+        return [archive / part for part in parts]
+    if len(members) == 1:
+        return members
+    listed = ", ".join(file.name for file in members) or "none"
+    message = f"{len(members)} text logs are in the zip file ({listed}), and the profile names none as its parts"
+    raise IngestError(message, str(archive), code="missing_column", hint="name one: log.zip/Accelerometer.csv")
 
 
 def read_frame(frame: pd.DataFrame, name: str = "(DataFrame)", profile: Profile | None = None) -> Log:
@@ -152,7 +166,7 @@ def propose(paths: Paths, evidence: Evidence | None = None) -> list[Proposal]:
     from imu_logs import guesses, proposal  # noqa: PLC0415  (only where it is needed)
 
     files = [Path(p) for p in ([paths] if isinstance(paths, str | os.PathLike) else paths)]
-    return proposal.propose([proposal.layouts_of(f)[0] for f in files], evidence or guesses.Evidence())
+    return proposal.propose([log for f in files for log in proposal.layouts_of(f)], evidence or guesses.Evidence())
 
 
 def write(log: Log, path: str | os.PathLike[str], decimals: Mapping[str, int] = MappingProxyType({})) -> None:

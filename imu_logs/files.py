@@ -9,13 +9,14 @@ from __future__ import annotations
 import os
 import stat
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+from zipfile import BadZipFile, ZipFile
 
 from imu_logs.errors import ConfigurationError, IngestError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 
 class MessageFormat(NamedTuple):
@@ -34,8 +35,13 @@ MESSAGE_FORMATS = {
     ".h5": MessageFormat("HDF5", "h5py", "hdf5"),
     ".hdf5": MessageFormat("HDF5", "h5py", "hdf5"),
     ".mat": MessageFormat("MATLAB", "h5py", "hdf5"),
+    ".tlog": MessageFormat("MAVLink telemetry", "pymavlink.mavutil", "ardupilot"),
+    ".tdms": MessageFormat("TDMS", "nptdms", "tdms"),
+    ".npy": MessageFormat("NumPy", "numpy", ""),
+    ".npz": MessageFormat("NumPy", "numpy", ""),
 }
-SUFFIXES = (".csv", ".gcsv", ".mcap", *MESSAGE_FORMATS, ".BIN")  # .BIN: as ArduPilot names its logs
+ZIP = ".zip"  # of text logs
+SUFFIXES = (".csv", ".gcsv", ".mcap", *MESSAGE_FORMATS, ZIP, ".BIN")  # .BIN: as ArduPilot names its logs
 KINDS = {
     stat.S_IFDIR: "a directory",
     stat.S_IFIFO: "a FIFO",
@@ -43,6 +49,9 @@ KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
+TEXTS = (".csv", ".txt", ".tsv", ".dat")
+LARGEST_MEMBER = 1 << 32  # bytes
+PRINTABLE = 64  # first bytes of a text
 UTF_16 = "UTF-16 text: save it as UTF-8"
 # A text of less than 1024 bytes that Git LFS keeps in place of a file (git-lfs, docs/spec.md, "The Pointer").
 POINTER, LARGEST_POINTER = b"version https://git-lfs.github.com/spec/", 1024
@@ -54,7 +63,7 @@ FOREIGN = {
     b"\x28\xb5\x2f\xfd": "a zstd file: decompress it first",
     b"BZh": "a bzip2 file: decompress it first",
     b"\xfd7zXZ": "an xz file: decompress it first",
-    b"PK\x03\x04": "a zip or Excel file: export it as text",
+    b"PK\x03\x04": "a zip or Excel file: give a zip of text logs the suffix .zip, export others as text",
     b"\xd0\xcf\x11\xe0": "an Excel file of the old kind: export it as text",
     b"SQLite format 3": "an SQLite database: give a ROS 2 bag the suffix .db3",
     b"#ROSBAG": "a ROS 1 bag: give it the suffix .bag",
@@ -64,9 +73,77 @@ FOREIGN = {
     b"ULog\x01\x12\x35": "a ULog file: give it the suffix .ulg",
     b"\xa3\x95\x80\x80": "a DataFlash log: give it the suffix .bin",
     b"PAR1": "a Parquet file: export it as text",
+    b"H Product:Blackbox": "a blackbox log of Betaflight or INAV: decode it by blackbox_decode (blackbox-tools) to CSV",
+    b"TDSm": "a LabVIEW TDMS file: give it the suffix .tdms",
+    b"\x93NUMPY": "a NumPy array: give it the suffix .npy",
+    b"\xfa\xff": "an Xsens binary log: export it as text by MT Manager or MVN",
+    b"\xb5b": "a u-blox binary log: export it as text",
+    b"RIFF": "a video or sound (RIFF), no log",
     b"\xff\xfe": UTF_16,
     b"\xfe\xff": UTF_16,
 }
+
+
+SECOND_PLACE = {b"ftyp": "a video (MP4): extract its telemetry by gpmf-parser or Gyroflow, as .gcsv"}  # from byte 4
+MAVLINK = b"\xfd\xfe"  # starts of a packet of MAVLink 2 and 1, after a time in us, big endian
+TLOG = "a MAVLink telemetry log: give it the suffix .tlog"
+YEARS_US = (946_684_800_000_000, 4_102_444_800_000_000)  # 2000 to 2100
+
+
+def kind_of(start: bytes) -> str:
+    """Return what a file is that is no text log, and what to do, by its first 18 bytes; empty for any other."""
+    found = next((what for magic, what in FOREIGN.items() if start.startswith(magic)), "")
+    time_us = int.from_bytes(start[:8], "big")
+    if not found and start[8:9] and start[8] in MAVLINK and YEARS_US[0] < time_us < YEARS_US[1]:
+        return TLOG
+    return found or SECOND_PLACE.get(start[4:8], "")
+
+
+def is_message_log(path: Path) -> bool:
+    """Return whether a file is a log of messages or arrays, by its suffix; a text with the suffix ``.mat`` is none."""
+    suffix = path.suffix.lower()
+    if suffix == ".mat" and path.is_file():
+        with path.open("rb") as stream:
+            start = stream.read(PRINTABLE)
+        return (
+            start.startswith(b"MATLAB")
+            or not start.decode("latin-1").replace("\n", "").replace("\t", "").replace("\r", "").isprintable()
+        )
+    return suffix in (".mcap", *MESSAGE_FORMATS)
+
+
+def archive_of(path: Path) -> Path | None:
+    """Return the zip file of a path to a text log in it, ``log.zip/Accelerometer.csv``; None for any other path."""
+    return path.parent if path.parent.suffix.lower() == ZIP and path.parent.is_file() else None
+
+
+def text_members(archive: Path) -> list[Path]:
+    """Return the paths of the text logs in a zip file."""
+    with _opened(archive) as opened:
+        names = [i.filename for i in opened.infolist() if i.file_size and Path(i.filename).suffix.lower() in TEXTS]
+    return [archive / Path(name).name for name in names if "__MACOSX" not in name]
+
+
+def member(archive: Path, name: str) -> bytes:
+    """Return the content of a text log in a zip file, of at most ``LARGEST_MEMBER`` bytes."""
+    with _opened(archive) as opened:
+        found = next((i for i in opened.infolist() if Path(i.filename).name == name), None)
+        if found is None:
+            raise IngestError(f"holds no {name}", str(archive), code="unreadable")
+        if found.file_size > LARGEST_MEMBER:
+            message = f"{name} has {found.file_size} bytes unpacked, and {LARGEST_MEMBER} are read"
+            raise IngestError(message, str(archive), code="unreadable", hint="unpack the file")
+        return opened.read(found)
+
+
+@contextmanager
+def _opened(archive: Path) -> Iterator[ZipFile]:
+    """Open a zip file; raise ``IngestError`` where it is damaged or encrypted."""
+    try:
+        with ZipFile(archive) as opened:
+            yield opened
+    except (BadZipFile, RuntimeError, NotImplementedError) as error:
+        raise IngestError(f"a zip file that cannot be read: {error}", str(archive)) from None
 
 
 def is_mat_5(path: Path) -> bool:
@@ -143,7 +220,6 @@ def unchanged(path: Path) -> Iterator[None]:
 
 def refuse_foreign(start: bytes, path: str) -> None:
     """Raise ``IngestError`` for a file that begins like another kind of file."""
-    for magic, what in FOREIGN.items():
-        if start.startswith(magic):
-            code = "utf16" if what == UTF_16 else "foreign"
-            raise IngestError(f"not a text log but {what}", path, code=code)
+    what = kind_of(start)
+    if what:
+        raise IngestError(f"not a text log but {what}", path, code="utf16" if what == UTF_16 else "foreign")

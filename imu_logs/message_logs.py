@@ -2,7 +2,8 @@
 
     ULog       (pyulog)     each logged message is a topic; no units
     DataFlash  (pymavlink)  each message type is a topic, with the units of the messages FMTU, UNIT and MULT
-    HDF5, MATLAB 7.3 (h5py), MATLAB 5 (scipy.io)
+    tlog       (pymavlink)  each type of MAVLink message is a topic, with the units of its definition
+    HDF5, MATLAB 7.3 (h5py), MATLAB 5 (scipy.io), TDMS (nptdms), NumPy
                             a group (a struct) is a topic, its arrays are the fields; samples are along the longer
                             dimension; a unit is the attribute ``unit`` or ``units``
 
@@ -52,6 +53,7 @@ MARKED = 3  # bytes of a DataFlash message before its fields: two marks and its 
 MARKS, FORMAT, LENGTH_OF_FORMAT = b"\xa3\x95", 0x80, 89  # libraries/AP_Logger/LogStructure.h of ArduPilot
 MOST_GARBAGE = 528  # bytes at the end of a log that was written in blocks, as pymavlink allows
 TIME = "TimeUS"
+TIME_OF_TDMS = "time"
 MIN_SAMPLE_ROWS = 2  # shorter arrays are settings, not samples
 MAX_DIMENSIONS = 3  # dimensions: images, not read
 MAX_COLUMNS = 64  # columns; a wider array is an image or a matrix
@@ -64,7 +66,8 @@ class LogReader(MessageReader):
     def __init__(self, path: Path, known: MessageFormat) -> None:
         super().__init__(str(path))
         self.file, self.kind = path, known.kind
-        self.messages = {"ros": _of_bag, "ulog": _of_ulog, "ardupilot": _of_dataflash}.get(known.extra, _of_arrays)
+        kinds = {".tlog": _of_telemetry, ".bin": _of_dataflash, ".ulg": _of_ulog, ".bag": _of_bag, ".db3": _of_bag}
+        self.messages = kinds.get(path.suffix.lower(), _of_arrays)
         with path.open("rb") as stream:
             self.sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -256,8 +259,44 @@ def _of_dataflash(log: LogReader) -> Iterator[ChannelMessages]:
             yield _of_columns(log, _instance(known.name, sensor), part, units, times)
 
 
+def _of_telemetry(log: LogReader) -> Iterator[ChannelMessages]:
+    """Yield the topics of a MAVLink telemetry log: packets, each after the time of the receiver in us."""
+    from pymavlink import mavutil  # noqa: PLC0415  (an extra)
+
+    found: dict[str, list[Any]] = {}
+    connection = mavutil.mavlink_connection(log.path)
+    try:
+        while (message := connection.recv_msg()) is not None:
+            if message.get_type() != "BAD_DATA":
+                found.setdefault(message.get_type(), []).append(message)
+    finally:
+        connection.close()
+    for name, messages in found.items():
+        first = messages[0]
+        columns = {f: np.array([getattr(m, f) for m in messages]) for f in first.get_fieldnames()}
+        columns = {f: column for f, column in columns.items() if column.dtype.kind in "iuf" and column.ndim == 1}
+        units = {f: unit for f, unit in first.fieldunits_by_name.items() if f in columns}
+        recorded = np.rint(np.array([m._timestamp for m in messages]) * 1e6).astype(np.int64) * 1000  # noqa: SLF001
+        if columns:
+            yield _of_columns(log, name, columns, units, recorded)
+
+
 def _of_arrays(log: LogReader) -> Iterator[ChannelMessages]:
-    if is_mat_5(log.file):
+    if log.kind == "NumPy":
+        content = np.load(log.file, allow_pickle=False)
+        arrays = dict(content) if isinstance(content, np.lib.npyio.NpzFile) else {log.file.stem: content}
+        yield from _of_group(log, "", arrays)
+    elif log.kind == "TDMS":
+        from nptdms import TdmsFile  # noqa: PLC0415  (an extra)
+
+        for group in TdmsFile.read(log.file).groups():
+            channels = {c.name: (c[:], str(c.properties.get("unit_string", ""))) for c in group.channels() if len(c)}
+            steps = {c.properties["wf_increment"] for c in group.channels() if "wf_increment" in c.properties}
+            if len(steps) == 1 and TIME_OF_TDMS not in channels:  # a waveform: its times are counted
+                rows = max(len(values) for values, _ in channels.values())
+                channels[TIME_OF_TDMS] = (np.arange(rows) * float(steps.pop()), "s")
+            yield from _of_group(log, f"/{group.name}", channels)
+    elif is_mat_5(log.file):
         from scipy.io import loadmat  # noqa: PLC0415  (few logs need it)
 
         content = loadmat(log.file, simplify_cells=True)

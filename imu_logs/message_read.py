@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 LONGEST_ARRAY = 16  # elements of a field that may be readings
-OF_ARRAYS = ("HDF5", "MATLAB")  # formats whose arrays a user names
+OF_ARRAYS = ("HDF5", "MATLAB", "NumPy", "TDMS")  # formats whose arrays a user names
 
 
 def read_logs(paths: Sequence[Path], profile: Profile) -> Log:

@@ -21,7 +21,8 @@ import numpy as np
 
 from imu_logs.clocks import find_bursts
 from imu_logs.columns import TEMPERATURE_RANGE, Columns, find_columns, find_layout, stated_unit, whole, words_of
-from imu_logs.files import MESSAGE_FORMATS
+from imu_logs.errors import IngestError
+from imu_logs.files import ZIP, is_message_log, member, refuse_foreign, text_members
 from imu_logs.guesses import (
     CENTIDEGREES,
     OF_SENSOR,
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from imu_logs.log import Values
 
 
-UNITS_OF = {"accelerometer": ("g", "mg", "ug", "m/s^2"), "gyroscope": ("deg/s", "mdps", "rad/s")}
+UNITS_OF = {"accelerometer": ("g", "mg", "ug", "m/s^2"), "gyroscope": ("deg/s", "mdps", "rad/s", "mrad/s")}
 LEAST_GRAVITY = 0.3  # of gravity, for the median |a| of a log; quality_flags refuses less
 FEWEST_LABELS, MOST_LABELS = 3, 4  # two texts may be states of the logger; labels that a remark names
 SEARCHED_BYTES = 1 << 25  # of a text log, for its layout
@@ -118,16 +119,32 @@ class Proposal:
 
 
 def layouts_of(path: Path) -> list[UnknownLog]:
-    """Return the columns of a text log, or those of each topic of a message log, most sensors first.
+    """Return the columns of a text log, of each log with readings in a zip file, or of the topic with most sensors.
 
     Raises ``IngestError`` for a file without a table of numbers.
     """
-    if path.suffix.lower() in (".mcap", *MESSAGE_FORMATS):
+    if is_message_log(path):
         from imu_logs.message_read import topics_of  # noqa: PLC0415  (only where it is needed)
 
-        return topics_of(path)
+        return topics_of(path)[:1]  # the one with most sensors
+    if path.suffix.lower() == ZIP:
+        tables = [layout for file in text_members(path) for layout in _table_in(path, file)]
+        found = [layout for layout in tables if find_columns(layout).triads]
+        if not found:
+            raise IngestError("no text log in it holds the three axes of a sensor", str(path), code="no_table")
+        return found
     with path.open("rb") as stream:
-        return [find_layout(stream.read(SEARCHED_BYTES), str(path))]
+        data = stream.read(SEARCHED_BYTES)
+    refuse_foreign(data[:18], str(path))
+    return [find_layout(data, str(path))]
+
+
+def _table_in(archive: Path, file: Path) -> list[UnknownLog]:
+    """Return the columns of a text log in a zip file; none for a text without a table of numbers."""
+    try:
+        return [find_layout(member(archive, file.name)[:SEARCHED_BYTES], str(file))]
+    except IngestError:
+        return []
 
 
 def propose(logs: Sequence[UnknownLog], evidence: Evidence) -> list[Proposal]:
@@ -358,8 +375,8 @@ def _without_gravity(log: UnknownLog, triad: tuple[int, int, int], unit: str | N
     if unit not in FORCE_UNITS or size > LEAST_GRAVITY * FORCE_UNITS[unit]:
         return ""
     return (
-        f"|a| is {size:.3g} {unit} on the whole: acceleration without gravity, which calibrates nothing; take the columns "
-        "or the file with gravity (TotalAcceleration beside Accelerometer, Acc beside FreeAcc)"
+        f"|a| is {size:.3g} {unit} on the whole: acceleration without gravity, which calibrates nothing; take the "
+        "columns or the file with gravity (TotalAcceleration beside Accelerometer, Acc beside FreeAcc)"
     )
 
 

@@ -320,7 +320,7 @@ def _read_head(path: Path) -> tuple[list[str], dict[str, str], int]:
     """Return the column names, all other facts of the head, and the number of lines before the column names."""
     with unchanged(path), path.open("rb") as stream:
         start = stream.read(LONGEST_HEADER)
-    refuse_foreign(start[:16], str(path))
+    refuse_foreign(start[:18], str(path))
     lines = start.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").split(b"\n")
     if not any(lines[0].startswith(first) for first in FIRST_LINES):
         message = f"not a .gcsv file: it starts with {lines[0][:40]!r}, GYROFLOW IMU LOG is expected"

@@ -222,7 +222,7 @@ class TextLog:
             remaining -= len(chunk)
             self.digest.update(chunk)
             if position == 0:
-                refuse_foreign(chunk[:16], self.path)
+                refuse_foreign(chunk[:18], self.path)
                 if chunk.startswith(BOM):
                     detail = "a byte order mark before the first line was skipped"
                     self.first_notes.append(Note("N-BOM", 1, 1, 1, detail))

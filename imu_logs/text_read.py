@@ -19,6 +19,7 @@ logger.
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
@@ -30,7 +31,7 @@ import pyarrow as pa
 
 from imu_logs.clocks import bursts_error, counted, sorted_once, with_regular_clock
 from imu_logs.errors import IngestError
-from imu_logs.files import unchanged
+from imu_logs.files import archive_of, member, unchanged
 from imu_logs.log import REPAIRED, Log, Note, in_house_unit, joined
 from imu_logs.profile import AUTO, DROP, GAP, Checks, Column, CsvFormat
 from imu_logs.text_layout import PARTS, Fault, TextLayout, column_notes, find_columns, find_faults, gcsv_format, refusal
@@ -63,6 +64,10 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
 
 def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> Log:
     """Read the channels of one file; an ``IngestError`` names the line."""
+    archive = archive_of(path)
+    if archive is not None:
+        with unchanged(archive):
+            return read_stream(io.BytesIO(member(archive, path.name)), str(path), settings, checks)
     with unchanged(path), path.open("rb") as stream:
         return read_stream(stream, str(path), settings, checks)
 

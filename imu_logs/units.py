@@ -30,7 +30,13 @@ TRIADS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE}
 
 # Per quantity: unit to (multiplier, divisor); two numbers, because 1001.5 mg / 1000 is exact and times 0.001 is not.
 _FORCE = {"g": (1.0, 1.0), "mg": (1.0, 1000.0), "ug": (1.0, 1e6), "m/s^2": (1.0, STANDARD_GRAVITY), COUNTS: (1.0, 1.0)}
-_RATE = {"deg/s": (1.0, 1.0), "mdps": (1.0, 1000.0), "rad/s": (DEGREES, 1.0), COUNTS: (1.0, 1.0)}
+_RATE = {
+    "deg/s": (1.0, 1.0),
+    "mdps": (1.0, 1000.0),
+    "mrad/s": (DEGREES, 1000.0),
+    "rad/s": (DEGREES, 1.0),
+    COUNTS: (1.0, 1.0),
+}
 _ANGLE = {"deg": (1.0, 1.0), "rad": (DEGREES, 1.0), COUNTS: (1.0, 1.0)}
 _TEMPERATURE = {"degC": (1.0, 1.0), COUNTS: (1.0, 1.0)}
 _RATIO = {"1": (1.0, 1.0)}
@@ -66,7 +72,7 @@ SPELLINGS = {
     "rads/s": "rad/s", "s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us", "μs": "us", "ns": "ns",
     "deg": "deg", "°": "deg", "rad": "rad", "degc": "degC", "°c": "degC", "c": "degC", "celsius": "degC",
     "counts": "counts", "lsb": "counts", "raw": "counts", "digit": "counts", "digits": "counts", "ug": "ug", "µg": "ug",
-    "μg": "ug", "mdps": "mdps", "mdeg/s": "mdps", "m°/s": "mdps",
+    "μg": "ug", "mrad/s": "mrad/s", "mdps": "mdps", "mdeg/s": "mdps", "m°/s": "mdps",
 }  # fmt: skip
 BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 

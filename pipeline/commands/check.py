@@ -447,7 +447,7 @@ def _layouts(reading: Reading, code: str) -> list[UnknownLog]:
     layouts = []
     for file in reading.files if code in UNKNOWN_LAYOUT else ():
         try:
-            layouts.append(layouts_of(file)[0])
+            layouts += layouts_of(file)
         except IngestError as none:
             print(f"{file}: {none.message}\n")
     return layouts

@@ -10,7 +10,7 @@ from pathlib import Path
 from shutil import copyfile
 from typing import TYPE_CHECKING, Literal
 
-from imu_logs.files import MESSAGE_FORMATS, SUFFIXES
+from imu_logs.files import SUFFIXES, ZIP, is_message_log
 from imu_logs.profile import checks_of
 from pipeline.config.compose import Composer
 from pipeline.config.options import Problem, nearest
@@ -69,7 +69,7 @@ class Reading:
     @property
     def has_topics(self) -> bool:
         """Whether the recording is a message log: MCAP, or a format that needs an extra."""
-        return self.files[0].suffix.lower() in (".mcap", *MESSAGE_FORMATS)
+        return is_message_log(self.files[0])
 
     def recording(self) -> Recording:
         """Return the recording, without checks."""
@@ -183,7 +183,7 @@ def _named(profile: str, file: Path, campaign: Path | None) -> str:
 
 def complete_rows(file: Path, folder: Path) -> Path:
     """Return a copy in ``folder`` of a text log up to its last complete row; logs of messages as they are."""
-    if file.suffix.lower() in (".mcap", *MESSAGE_FORMATS):
+    if is_message_log(file) or file.suffix.lower() == ZIP:
         return file
     copy = folder / file.name
     copy.write_bytes(file.read_bytes().rpartition(b"\n")[0] + b"\n")

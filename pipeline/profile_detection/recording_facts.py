@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import textwrap
+from contextlib import suppress
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from imu_logs.files import MESSAGE_FORMATS
+from imu_logs.files import MESSAGE_FORMATS, kind_of
 from imu_logs.guesses import BURST_INTERVAL_DIFFERENCE
 from imu_logs.mcap_file import McapReader
 from imu_logs.message_decoder import ARRAYS, KINDS, object_decoder, ros_layouts
@@ -275,6 +276,9 @@ def topic_lines(path: Path, *, fields: bool) -> list[Line]:
                 if rows.channel not in first:
                     first[rows.channel] = rows.payload(0)
     except (IngestError, OSError):
+        with suppress(OSError), path.open("rb") as stream:
+            kind = kind_of(stream.read(18)).partition(":")[0]
+            return [("kind", f"{kind}, by its first bytes")] if kind else []
         return []
     size, proof = counted(reader.count, "message"), "integrity: not_verifiable, without checksums"
     if isinstance(reader, McapReader):

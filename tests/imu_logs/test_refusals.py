@@ -165,7 +165,8 @@ def test_missing_files_are_named_together_with_what_was_tried(tmp_path: Path, ca
     write_recording(tmp_path / "b.csv", make_recording())
     with pytest.raises(MissingInputError) as caught:
         read_recordings(procedure("a", "b", "c", optional=("d",)), ingest_of(canonical), SENSOR, tmp_path)
-    tried = "{0} (tried {0}.csv, .gcsv, .mcap, .bag, .db3, .ulg, .bin, .h5, .hdf5, .mat, .BIN)"
+    tried = "{0} (tried {0}.csv, .gcsv, .mcap, .bag, .db3, .ulg, .bin, .h5, .hdf5, .mat, .tlog, .tdms, .npy, .npz, "
+    tried += ".zip, .BIN)"
     assert caught.value.message == f"missing recordings: {tried.format('a')}; {tried.format('c')}"
     assert caught.value.file == str(tmp_path)
 
@@ -261,9 +262,9 @@ def change(ingest: dict[str, Any], key: str, value: Any) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("csv/columns/accel_x/unit", "m/s2", "columns.accel_x.unit is 'm/s2'; allowed are g, mg, m/s^2, counts"),
+        ("csv/columns/accel_x/unit", "m/s2", "columns.accel_x.unit is 'm/s2'; allowed are g, mg, ug, m/s^2, counts"),
         ("csv/columns/accel_x/unit", None, "columns.accel_x.unit is None; allowed are g, mg"),
-        ("csv/columns/gyro_x/unit", "g", "columns.gyro_x.unit is 'g'; allowed are deg/s, rad/s, counts"),
+        ("csv/columns/gyro_x/unit", "g", "columns.gyro_x.unit is 'g'; allowed are deg/s, mdps, mrad/s, rad/s, counts"),
         ("csv/columns/accel_x/unit", "counts", "accel_x.counts_per_unit is None; counts need a number"),
         ("csv/columns/accel_x/counts_per_unit", 2.0, "belong to the unit counts; this is g"),
         ("csv/columns/accel_x/column", 3, "accel_x.column is 3; it is a name of the header"),
