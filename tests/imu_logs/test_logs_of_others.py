@@ -81,7 +81,8 @@ NAMES = "t [s],ax [g],ay [g],az [g],gx [deg/s],gy [deg/s],gz [deg/s]"
 @pytest.mark.parametrize(
     ("header", "end"),
     [
-        (f"% {NAMES}", ""), (f"// {NAMES}", ""), (f"//{NAMES}", ""), (NAMES, ","), (f"{NAMES},", ""), (f"{NAMES},", ","),
+        (f"% {NAMES}", ""), (f"// {NAMES}", ""), (f"//{NAMES}", ""),
+        (NAMES, ","), (f"{NAMES},", ""), (f"{NAMES},", ","),
     ],
 )  # fmt: skip
 def test_headers_behind_marks_and_separators_at_the_ends_of_lines(tmp_path: Path, header: str, end: str) -> None:
