@@ -66,6 +66,8 @@ LOG_EVENTS = (
     "GROUP_INFO",
 )
 SCHEDULER_MESSAGES = ("Select jobs to execute", "Execute ")
+# Snakemake's reports of a failed job: the last lines of a run state the cause, Snakemake's log has the reports
+JOB_FAILURES = ("RuleException", "Exiting because a job", "WorkflowError:\nAt least one job did not complete")
 REFUSALS = ("LockException", "ProtectedOutputException")  # Snakemake's errors before any job
 INTERRUPTED = ("Terminating processes on user request", "Shutting down, this might take")  # Ctrl-C; SIGTERM
 
@@ -350,7 +352,8 @@ class Monitor(logging.Handler):
         """Suppress Snakemake's block for each job, and clear the progress line before its other messages."""
 
         def passes(record: logging.LogRecord) -> bool:
-            if _event(record) in LOG_EVENTS or str(record.msg).startswith(SCHEDULER_MESSAGES):
+            text = str(record.msg)
+            if _event(record) in (*LOG_EVENTS, "JOB_ERROR") or text.startswith((*SCHEDULER_MESSAGES, *JOB_FAILURES)):
                 return False
             self.stream.write(clear)
             return True
@@ -363,7 +366,7 @@ class Monitor(logging.Handler):
         start = time.monotonic()
         while not self.ended.wait(INTERVAL[terminal]):
             minutes, seconds = divmod(round(time.monotonic() - start), 60)
-            line = f"[{minutes}:{seconds:02d}] {self.progress.text()}"
+            line = f"{self.progress.text()} | {minutes}:{seconds:02d} since the start"
             if terminal:
                 line = CLEAR_LINE + line[: (os.get_terminal_size(self.stream.fileno()).columns or 80) - 1]
             self.stream.write(line + "\n" * (not terminal))

@@ -18,6 +18,7 @@ from pipeline.outcome import (
     commands_of,
     found_mountings,
     once_command,
+    outcome,
     run_command,
 )
 
@@ -123,3 +124,20 @@ def test_units_of_one_bench_share_the_settings_of_their_mounting_with_the_mean_o
     assert yaml.safe_load(text.partition("or, in place of these:\n")[2].replace("  # - ", "- ")) == [
         "sensor.axis_map=[-y,+x,+z]"
     ]
+
+
+@pytest.mark.parametrize("units", [1, 10, 11, 300])
+def test_the_last_15_lines_name_each_unit_with_a_missing_effect_or_what_lists_them(tmp_path: Path, units: int) -> None:
+    results = tmp_path / "fleet"
+    results.mkdir()
+    head = "unit,status,gyroscope_verdict,gyroscope_selected,gyroscope_not_in_uncertainty"
+    rows = [f"U{i},ok,missing_effect,effect_{i % 4},source {i}" for i in range(units)]
+    (results / "summary.csv").write_text("\n".join([head, *rows, *(f"V{i},ok,unexplained,,x{i}" for i in range(30))]))
+    last = outcome(results, {"campaign": "fleet"}, of_this_run=False).splitlines()[-15:]
+    if units <= 10:
+        for i in range(units):
+            assert any(f"U{i}" in line.replace(";", ",") and f"effect {i % 4}" in line for line in last)
+    else:
+        assert f"effect missing: {units} units; to list them:" in last
+        assert f"  python -m pipeline explain fleet --all --results {tmp_path}" in last
+    assert last[-1].startswith("  python -m pipeline add fleet ")

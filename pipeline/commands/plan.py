@@ -7,13 +7,14 @@ import json
 import shlex
 from dataclasses import replace
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects import read_effect_files, register
 from pipeline.planning.changes import PlanGain, best_changes, helps_most
-from pipeline.planning.plan import plan_of, plan_text
+from pipeline.planning.plan import WIDTH, plan_of, plan_text
 from pipeline.simulation.description import UnitDescription, add_recording_options, described, read_description
 
 if TYPE_CHECKING:
@@ -49,7 +50,8 @@ def main(argv: Sequence[str]) -> int:
         more = {"against": second} if second is not None else {"extra": [_of_gain(gain) for gain in gains]}
         print(json.dumps({**document, **more}, indent=1))
         return 0
-    helps = helps_most(gains)
+    indent = " " * 5  # that of the second line of a proposal
+    helps = [part for line in helps_most(gains) for part in wrap(line, WIDTH, subsequent_indent=indent) or [line]]
     print("\n".join([*plan_text(document, second), *(["", *helps] if helps else [])]))
     return 0
 

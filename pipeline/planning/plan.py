@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from pipeline.settings import DataSheet, Settings
     from pipeline.simulation.trajectory import Planned
 
+WIDTH = 100  # columns of a plan on the terminal
 CLEARLY_LARGER = 1.2  # times the smallest size: least size of a named effect that is printed
 SEED = 0  # of the simulated noise, so that a plan is reproducible
 # The middle of the random values of a simulated unit, which warms up by some degrees in a room that changes little.
@@ -239,8 +241,9 @@ def plan_text(document: Document, second: Document | None = None) -> list[str]:
         rows=_rows,
         hidden=lambda part: [[entry["effect"], entry["reason"]] for entry in part["not_observable"]],
         both=_compared,
+        width=WIDTH,
     )
-    return text.splitlines()
+    return [part for line in text.splitlines() for part in ([line] if len(line) <= WIDTH else wrap(line, WIDTH))]
 
 
 def _rows(part: Mapping[str, Any]) -> list[list[str]]:
@@ -250,12 +253,15 @@ def _rows(part: Mapping[str, Any]) -> list[list[str]]:
             entry["effect"],
             size_text(entry["smallest"], entry["unit"]),
             share_text(entry["share_of_limit"]),
-            ", ".join(f"{a['effect']} {a['share']:.2f}" for a in entry["look_alikes"][:2]),
-            _note(entry),
+            "; ".join(filter(None, [_alike(entry), _note(entry)])),
         ]
         for entry in part["effects"]
     ]
-    return [["effect", "smallest size", "of limit", "similar signal", "note"], *rows] if rows else []
+    return [["effect", "smallest size", "of limit", "similar signal; what would be named"], *rows] if rows else []
+
+
+def _alike(entry: Mapping[str, Any]) -> str:
+    return ", ".join(f"{a['effect']} {a['share']:.2f}" for a in entry["look_alikes"][:2])
 
 
 def _note(entry: Mapping[str, Any]) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from functools import lru_cache
+from textwrap import wrap
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -133,8 +134,14 @@ def unit_text(unit: object) -> str:
     return "" if unit in (None, "1") else typeset(str(unit))
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return rows as lines of a terminal with aligned columns."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    cells = ([cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows)
-    return [f"  {'  '.join(line)}".rstrip() for line in cells]
+def aligned(rows: Sequence[Sequence[str]], width: int | None = None) -> list[str]:
+    """Return rows as lines of a terminal with aligned columns; the last column is wrapped to the width."""
+    if not rows:
+        return []
+    *widths, _ = (max(map(len, column)) for column in zip(*rows, strict=True))
+    lines, start = [], 2 + sum(widths) + 2 * len(widths)
+    for *cells, last in rows:
+        parts = wrap(last, width - start, break_long_words=False) if width and last else [last]
+        head = "".join(f"{cell.ljust(size)}  " for cell, size in zip(cells, widths, strict=True))
+        lines += [f"  {head}{parts[0]}".rstrip(), *(" " * start + part for part in parts[1:])]
+    return lines

@@ -190,3 +190,44 @@ def test_the_held_out_error_of_the_run_is_told_beside_what_noise_alone_leaves(
     (folder / "U2.json").write_text(json.dumps({"accelerometer": None, "gyroscope": gyroscope}))
     assert main([str(results / "bench"), "U2"]) == 0
     assert "on held-out motion is 0.022 deg/s, 2 times the noise floor" in unwrapped(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("units", [3, 400])
+def test_a_campaign_takes_at_most_24_rows_and_a_command_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, units: int
+) -> None:
+    monkeypatch.setenv("COLUMNS", "70")
+    verdicts = ["missing_effect", "unexplained", "left_by_method", "not_enough_data", "reference_in_doubt"]
+    folder = tmp_path / "results" / "fleet"
+    (folder / "diagnoses").mkdir(parents=True)
+    lines = ["unit,status,gyroscope_verdict,gyroscope_selected,gyroscope_next_step,pass"]
+    for i in range(units):
+        effect = f"effect_{i % 13}" if i % 5 == 0 else ""
+        lines.append(f"U{i},ok,{verdicts[i % 5]},{effect},record a longer turn about each axis in both senses,False")
+        (folder / "diagnoses" / f"U{i}.json").write_text("{}")
+    (folder / "summary.csv").write_text("\n".join(lines) + "\n")
+    assert main(["fleet", "--results", str(tmp_path / "results")]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert len(told) <= 24
+    commands = [line for line in told if line.lstrip().startswith(("python -m", "snakemake"))]
+    assert len(commands) >= 3
+    assert all(len(line) <= 70 for line in told if line not in commands)
+    assert told[0].startswith(f"fleet, {units} units: 0 ready, ")
+    if units == 400:
+        assert told[-1].split()[:5] == ["python", "-m", "pipeline", "explain", "fleet"]
+        assert "--all" in told[-1]
+
+
+def test_the_faulty_sensor_is_told_first_without_its_upper_limits(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    limits = {"warm_up": {"b": {"value": 0.1, "unit": "g"}}}
+    document = {"unit": "U2", "accelerometer": part([]) | {"upper_limit": limits}, "gyroscope": part(["g_sensitivity"])}
+    (results / "bench" / "diagnoses" / "U2.json").write_text(json.dumps(document))
+    said = []
+    for option in ([], ["--limits"]):
+        main(["bench", "U2", "--results", str(results), *option])
+        said.append(capsys.readouterr().out)
+        assert said[-1].index("\n  gyroscope\n") < said[-1].index("\n  accelerometer\n")
+    assert ["Upper limits (95 %)" in text for text in said] == [False, True]
+    assert "--limits adds the upper limits" in said[0]

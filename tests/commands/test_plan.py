@@ -142,3 +142,10 @@ def test_simulate_warns_of_the_hidden_effects_that_the_plan_cannot_show_and_writ
     truth = json.loads((tmp_path / "truth" / "U001.json").read_text(encoding="utf-8"))
     assert set(truth["gyroscope"]["effects"]) == {"scale_factor_asymmetry", "g_sensitivity", "table_tilt"}
     assert main(["simulate", str(tmp_path), "--quiet", "--effect", "gyro.table_tilt"]) != 0
+
+
+def test_a_plan_fits_100_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    for more in ([], ["--against", "--both-directions"]):
+        lines = _out(capsys, *QUICK, *more).splitlines()
+        assert max(map(len, lines)) <= 100
+        assert any("warm_up" in line for line in lines)

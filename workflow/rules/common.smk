@@ -69,7 +69,8 @@ else:
         KEPT_BEFORE = set(replaced_folders(CAMPAIGN.results))
         CHECKED = check_owner(CAMPAIGN, move=NO_RUN.isdisjoint(sys.argv))
     except PipelineError as error:
-        raise WorkflowError(str(error)) from None
+        # Snakemake would print the place in this file before the cause, and its traceback.
+        sys.exit(str(error))
     gc.freeze()  # the campaign stays in memory: garbage collection of thousands of configurations takes seconds
     if "{" in str(CAMPAIGN.results):
         CAMPAIGN.results.mkdir(parents=True, exist_ok=True)
