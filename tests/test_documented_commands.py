@@ -43,7 +43,8 @@ BEFORE = {  # what a reader would have at that command
     "cp inav.txt ../../../..",
     "effects_of_your_own.md": "cp log.csv LOG.csv; python -m pipeline new data/bench --sensor mpu6050; "
     + U1.format("data/bench"),
-    "fleet.md": "printf 'unit,sensor\\nU0123,mpu6050\\n' > my_fleet/units.csv",
+    "fleet.md": "printf 'unit,sensor\\nU0123,mpu6050\\n' > my_fleet/units.csv; "
+    "python -m pipeline simulate other/my_fleet --units 1",
     "record.md": "rm -rf my_bench",
     "your_bench.md": "sed '1s/time_s/Time (s)/; 1s/accel_\\(.\\)_g/A\\1 (g)/g; 1s/gyro_\\(.\\)_dps/G\\1 (deg\\/s)/g' "
     "log.csv > my_log.csv; mkdir my_logs; cp my_log.csv my_logs; rm -rf my_bench; "
