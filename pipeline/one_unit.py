@@ -24,6 +24,7 @@ from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, PipelineError, as_published, failure_of
 from pipeline.io.files import candidate_files, wrong_name
 from pipeline.io.read import IN_MEMORY, of_one_sensor, tried
+from pipeline.io.recordings_sheet import SHEET, sheet_of_mapping, with_sheet
 from pipeline.model.effects import registered
 from pipeline.outcome import run_command
 from pipeline.settings import UserEffectFiles
@@ -189,6 +190,7 @@ def unit_without_campaign(
     if folder != NO_CAMPAIGN:
         _require_recordings(folder)
         found = UnitFiles(folder, folder)
+        row = replace(row, config=with_sheet(row.config, folder))
     else:
         row, found = _of_mapping(row, recordings)
     return _configured(row, found)
@@ -240,6 +242,9 @@ def _of_mapping(row: UnitRow, recordings: Any) -> tuple[UnitRow, UnitFiles]:  # 
             f"{{'recording': frame}}; got {kind}"
         )
     procedure = row.config.procedure
+    if procedure.sheet is not None:
+        procedure = procedure.replaced(recordings=sheet_of_mapping(recordings))
+        recordings = {name: recording for name, recording in recordings.items() if name != SHEET}
     known = procedure.recordings
     for name in recordings:
         if name not in known:

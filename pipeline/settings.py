@@ -23,6 +23,7 @@ Axis = Literal["x", "y", "z"]
 SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 AxisMap = Annotated[list[SignedAxis], Field(min_length=3, max_length=3)]
 Sense = Literal[1, -1]
+Kind = Literal["rest", "attitudes", "turn", "moves", "slow", "soak", "table"]  # of a file in the sheet of recordings
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Setting = TypeVar("Setting")
 AnySection = TypeVar("AnySection", bound="Section")
@@ -189,6 +190,10 @@ class RecordingFile(Section):
     program: list[ProgramRest | ProgramTurn | Repeated] | None = None
     windows: list[Window] | None = None
     session: Annotated[int, Field(ge=1)] | None = None
+    kind: Kind | None = None
+    direction: OfAxes | None = None
+    angle_deg: Finite | None = None
+    angle_accuracy_deg: Positive | None = None
 
 
 class FacesByHand(Section):
@@ -214,6 +219,7 @@ class Procedure(Section):
     method: str | None = None
     folder: str
     recordings: dict[str, RecordingFile]
+    sheet: str | None = None
     holdout_every: Annotated[int, Field(ge=0)]
     holdout_from: Annotated[int, Field(ge=0)] = 0
     mounting_tolerance_deg: Positive = 5.0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.files import CONFIGS
+from pipeline.io.recordings_sheet import EXAMPLE
 from pipeline.model.sensor_file import settings_of_ranges
 from pipeline.outcome import run_command
 from pipeline.planning.changes import readme
@@ -23,6 +24,12 @@ if TYPE_CHECKING:
     from pipeline.settings import DataSheet, Table
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
+LISTED = """\
+# Recordings that a sheet lists
+
+Put the recordings of a unit into `raw/{0}` and write a row for each into `raw/{0}/recordings.csv`: what it holds, and
+for a turn its axis and angle. docs/recordings.md has a row for each case, and states what it determines.
+"""
 HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"
 EPILOG = """\
 On a terminal the command asks for the sensor, the ranges, the procedure and the table that no option states.
@@ -61,11 +68,14 @@ def main(argv: Sequence[str]) -> int:
             "(table hand); docs/record.md shows both"
         )
     unit = UnitDescription(arguments.unit, sensor=sensor_name, table=table_name, procedure=procedure_name)
-    text = readme(unit, arguments.directory.resolve().name)
+    sheet = procedure.get("sheet")
+    text = LISTED.format(arguments.unit) if sheet else readme(unit, arguments.directory.resolve().name)
     if ranges != _ranges_of(data_sheets):
         text += "\nThe sizes apply to the ranges in the sensor file; campaign.yaml states the ranges of this bench.\n"
     folder = arguments.directory / procedure["folder"].replace("{unit}", arguments.unit)
     folder.mkdir(parents=True, exist_ok=True)
+    if sheet and not (folder / sheet).exists():
+        (folder / sheet).write_text(EXAMPLE, encoding="utf-8")
     (arguments.directory / "README.md").write_text(text, encoding="utf-8")
     (arguments.directory / "campaign.yaml").write_text(
         _campaign(procedure_name, sensor_name, data_sheets, ranges), encoding="utf-8"

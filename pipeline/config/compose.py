@@ -49,6 +49,7 @@ from pipeline.estimation.stages import NOT_WANTED, check_stages, declared
 from pipeline.files import CONFIGS
 from pipeline.history import SENSORS
 from pipeline.io.files import candidate_files
+from pipeline.io.recordings_sheet import with_sheet
 from pipeline.model.sensor_file import completed, range_settings, without_overridden
 from pipeline.settings import OF_BENCH, SECTIONS, Ingest, Method, Procedure, Section, Sensor, Settings, Stages, Unit
 
@@ -104,6 +105,7 @@ class Composer:
         unit = resolved.replaced(
             unit=name, procedure=procedure.replaced(folder=procedure.folder.replace("{unit}", name))
         )
+        unit = with_sheet(unit, self.below / unit.procedure.folder)
         return with_given(unit, self.below) if GIVEN in (unit.method.accelerometer, unit.method.gyroscope) else unit
 
     def split(self, layers: Sequence[str]) -> tuple[dict[str, str], list[tuple[str, Any]]]:

@@ -156,8 +156,10 @@ def _recordings(campaign: Campaign, rows: Sequence[UnitRow]) -> str | None:
         return None
     digest = hashlib.sha256()
     for row in rows:
-        files = recording_files(row.config.procedure, row.config.ingest, campaign.folder(row.name))
-        for path in sorted({path for paths in files.values() for path in paths}):
+        folder, sheet = campaign.folder(row.name), row.config.procedure.sheet
+        files = recording_files(row.config.procedure, row.config.ingest, folder)
+        sheets = [path for path in [folder / (sheet or "")] if path.is_file()]
+        for path in sorted({*sheets, *(path for paths in files.values() for path in paths)}):
             status = path.stat()
             digest.update(f"{path}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
     return digest.hexdigest()[:16]

@@ -21,6 +21,7 @@ from pipeline.estimation.free_curves import OTHER
 from pipeline.estimation.noise import with_noises
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.stages import last_fit
+from pipeline.model.calibration_file import not_determined
 from pipeline.model.effects import catalogue, effect
 from pipeline.records import MATRIX, Noise, Recording, SensorCalibration, SensorDiagnosis, SensorValidation
 from pipeline.settings import Uncertainty
@@ -170,6 +171,7 @@ def evidence_of(
         fit=last_fit(case.calibration),
         as_printed=settings.method.as_printed,
         filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
+        held_by_limit=not_determined(case.calibration.to_json()) if settings.procedure.sheet else "",
         on_table=findings is None or findings.on_table,
     )
 

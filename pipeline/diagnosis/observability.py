@@ -53,10 +53,12 @@ def at_its_limit(this: Effect, sensor: str, limit: float) -> str:
     return f"even at its limit of {limit:.2g}{'' if unit == '1' else ' ' + unit} it would"
 
 
-def _hidden(sensor: str, modelled: Collection[str], reason: Callable[[Effect], str]) -> dict[str, str]:
+def _hidden(
+    sensor: str, modelled: Collection[str], reason: Callable[[Effect], str], kinds: Collection[str] = ()
+) -> dict[str, str]:
     """Return the reason for each effect of a sensor that is not observable, without those in the model.
 
-    Effects of single turns (``Effect.of_turns``) are left to the checks of the recordings.
+    Effects of single turns (``Effect.of_turns``) are left to the checks of the recordings. ``kinds``: of a sheet's.
     """
     found = {}
     for name, this in catalogue().items():
@@ -64,6 +66,8 @@ def _hidden(sensor: str, modelled: Collection[str], reason: Callable[[Effect], s
             continue
         within = next((other for other in modelled if name in effect(other).contains), None)
         text = f"{within}, which is in the model, contains it" if within else reason(this)
+        if this.shown_by and this.shown_by not in kinds and not within:
+            text = f"only recordings of kind {this.shown_by} (procedure listed) sweep the temperature far enough"
         if text:
             found[name] = text
     return found
@@ -163,7 +167,9 @@ def _faint(this: Effect, selection: Selection) -> str:
 def not_observable_by_hand(selection: by_hand.SelectionByHand, configured: Sequence[str]) -> dict[str, str]:
     """Return the reason for each effect that rests and moves cannot show, without those in the model."""
     modelled = [*configured, *selection.names]
-    return _hidden(selection.model.sensor, modelled, lambda this: _reason_by_hand(this, selection))
+    return _hidden(
+        selection.model.sensor, modelled, lambda this: _reason_by_hand(this, selection), selection.model.rests.kinds
+    )
 
 
 def _steady(span: float) -> str:
@@ -176,7 +182,7 @@ def _reason_by_hand(this: Effect, selection: by_hand.SelectionByHand) -> str:
     refused = refusal(this, model.sensor, model.rests)
     if refused:
         return refused
-    span = float(np.ptp(model.rests.temperature))
+    span = float(np.ptp(model.temperature))
     if "temperature" in this.needs and span < LEAST_SPAN_DEGC:
         return f"{_steady(span)}; it needs {this.excitation}"
     score = selection.first.scores.get(this.name)

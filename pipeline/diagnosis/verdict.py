@@ -84,6 +84,7 @@ class VerdictInput:
     fit: FitStage = field(default_factory=FitStage)  # last stage of the method
     as_printed: bool = False  # whether the method uses the equations of the thesis as printed
     filtered: bool = False
+    held_by_limit: str = ""  # parameters that the sensor file's limits determine, and what to record (a sheet's unit)
     on_table: bool = True  # a few rests by hand may have a small residual by chance
 
     @property
@@ -235,6 +236,7 @@ RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
     (Verdict.FLOOR_IN_DOUBT, "below", lambda e: e.published and e.published.below),
     (Verdict.FLOOR_IN_DOUBT, "too_quiet", lambda e: e.too_quiet),
     (Verdict.LEFT_BY_METHOD, "approximations", lambda e: e.found == Verdict.NOTHING_MISSING and e.approximations),
+    (Verdict.NOT_ENOUGH_DATA, "held", lambda e: e.found == Verdict.NOTHING_MISSING and e.held_by_limit),
 )
 
 
@@ -296,10 +298,9 @@ def _next_step(verdict: Verdict, diagnosis: SensorDiagnosis, e: VerdictInput) ->
         suspect = "the table's log and the mounting" if e.on_table else "the rests and turns"
         check = f"check {suspect} as said above, and record the recordings concerned again"
         return SAME_SESSION if e.static_differs and not e.doubts else check
-    if verdict == Verdict.FLOOR_IN_DOUBT:
-        return STATIC_AGAIN
     if verdict != Verdict.LEFT_BY_METHOD:
-        return ""
+        held = e.held_by_limit.rpartition(": ")[2] if verdict == Verdict.NOT_ENOUGH_DATA else ""
+        return STATIC_AGAIN if verdict == Verdict.FLOOR_IN_DOUBT else held
     changes = ["the equations as corrected (method.as_printed=false)"] if e.as_printed else []
     free = ["the default method" if e.given else "a method that fits the full matrix (method=reference_least_squares)"]
     changes += [] if e.fit.free else free

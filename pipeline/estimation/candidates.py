@@ -179,6 +179,7 @@ def candidates_for(observations: Observations, configured: Sequence[str]) -> lis
             name in configured
             or sensor not in this.sensors
             or sensor in this.unseen
+            or this.shown_by
             or (this.of_turns and not observations.mounting_in_doubt)
             or (name == "earth_rotation" and observations.earth)
             or (this.needs_clock and not observations.clock_shared)

@@ -66,7 +66,16 @@ from pipeline.estimation.gauss_markov import (
     orthonormal,
     variance_of_average,
 )
-from pipeline.records import SENSORS, Noise, Recording, UnitRecordings, WanderLikelihood, median
+from pipeline.records import (
+    NOISE_OF_ROWS,
+    SENSORS,
+    Noise,
+    Recording,
+    UnitRecordings,
+    WanderLikelihood,
+    median,
+    noise_of_steps,
+)
 from pipeline.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
 from pipeline.signal.quiet_motion import coarse_steps, component_along_gravity, creep_of_readings
 from pipeline.signal.rests import rest_readings, stretches_of, usable
@@ -113,6 +122,10 @@ def _not_below_rounding(noise: Noise, sensor: str, recordings: Sequence[Recordin
 
 def _of_recordings(sensor: str, fitted: list[Recording], data_sheet: DataSheet) -> Noise:
     """Return the noise as it shows in the recordings, else that of the sensor file."""
+    others = [r for r in fitted if NOISE_OF_ROWS not in r.source and r.kind != "soak"]
+    if fitted and not others:
+        return _of_means_or_soaks(sensor, fitted, data_sheet)
+    fitted = others
     static = [r for r in fitted if r.role == "static"]
     static_rests, rests = (
         [
@@ -137,6 +150,15 @@ def _of_recordings(sensor: str, fitted: list[Recording], data_sheet: DataSheet) 
         raise ConfigurationError(f"no recording holds readings of the {sensor}: record static (a rest of some minutes)")
     white = np.full(3, data_sheet.noise_density * np.sqrt(0.5 / fitted[0].interval))
     return _with_stated_wander(white, data_sheet, "data_sheet")
+
+
+def _of_means_or_soaks(sensor: str, recordings: list[Recording], data_sheet: DataSheet) -> Noise:
+    """Return the noise of units with neither rests nor turns; in a soak only the fast part of the bias is noise."""
+    soaks = [values for r in recordings if r.kind == "soak" and (values := r.reading(sensor)) is not None]
+    if not soaks:
+        return _with_stated_wander(np.full(3, recordings[0].source[NOISE_OF_ROWS][sensor]), data_sheet, "data_sheet")
+    steps = np.concatenate([np.abs(np.diff(values, axis=0)) for values in soaks])
+    return _with_stated_wander(noise_of_steps(steps), data_sheet, "rests")
 
 
 def _by_hand(recordings: list[Recording]) -> bool:

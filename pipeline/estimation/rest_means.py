@@ -15,8 +15,9 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.turns import stop_and_go
+from pipeline.model.effects.base import REFERENCE_TEMPERATURE
 from pipeline.model.kinematics import table_motion
-from pipeline.records import once
+from pipeline.records import NOISE_OF_ROWS, once
 from pipeline.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
 from pipeline.signal.quiet_motion import coarse_of, creep_of_rest, posterior_creep_rates, step_and_noise
 from pipeline.signal.rests import Rest, find_rests, rests_from_table, usable
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from pipeline.settings import Procedure, Settings, Table
 
 ROLE, HELD_OUT = "rests", "validation"
+SOAK = "soak"  # a kind of recording in the sheet
+OF_ALL = ("clock_shared", "kinds")  # fields of ``Rests`` that are no arrays
 
 
 @dataclass(frozen=True)
@@ -140,10 +143,38 @@ def rest_means(recording: Recording, rests: Sequence[Rest], sensor: str = "accel
     means = np.full((len(rests), 3), np.nan)
     filled = counts > 0
     means[filled] = centre + sums[filled] / counts[filled, None]
-    if sensor == "accelerometer" and recording.role in (ROLE, HELD_OUT) and recording.table_angle is None:
+    moved = recording.role in (ROLE, HELD_OUT) and recording.table_angle is None and recording.kind != SOAK
+    if sensor == "accelerometer" and moved:
         creeps = [creep_of_rest(recording, rest.start, rest.stop) for rest in rests]
         means *= 1.0 + np.array([creep.shortening for creep in creeps])[:, None]
     return means, counts
+
+
+def nearest_to_reference(temperature: Values) -> int:
+    """Return the part of a soak nearest to 25 degC, to which the effects of temperature refer; (k,) array, degC.
+
+    Without a temperature the middle one.
+    """
+    off = np.abs(temperature - REFERENCE_TEMPERATURE)
+    return len(off) // 2 if np.isnan(off).all() else int(np.nanargmin(off))
+
+
+def _warmth(recording: Recording, rests: Sequence[Rest]) -> Values:
+    """Return the mean temperature of each rest: (m,) array, degC; NaN where none was recorded."""
+    warmth = np.full(recording.samples, np.nan) if recording.temperature is None else temperature_of(recording)
+    return np.array([warmth[rest.start : rest.stop].mean() for rest in rests])
+
+
+def variances_of_means(recording: Recording, counts: Integers, sensor: str) -> tuple[Values, Values]:
+    """Return the variances of means by white noise: over that of a sample, and of means that were recorded as such.
+
+    Both are (m,) arrays, one of them zeros. ``counts``: (m,), samples of each.
+    """
+    none = np.zeros(len(counts))
+    stated = recording.source.get(NOISE_OF_ROWS)
+    if stated is not None:
+        return none, none + float(stated[sensor]) ** 2
+    return variance_of_mean(filter_autocovariance(recording), counts) if len(counts) else none, none
 
 
 def sound_samples(recording: Recording, sensor: str) -> Mask:
@@ -159,6 +190,7 @@ class Rests:
     reading: Values  # (m, 3), g or deg/s; means
     count: Integers  # (m,); samples of each
     share: Values  # (m,); variance of each mean by white noise, over that of a raw sample
+    own: Values  # (m,), g^2 or (deg/s)^2; variance of a mean that was recorded as such, whose share is 0
     scatter: Values  # (m, 3); sums of squares about the means
     # each (m,), s; start, length and mean time
     start: Values
@@ -167,6 +199,7 @@ class Rests:
     temperature: Values  # (m,), degC; NaN where none was recorded
     recording: Index  # (m,); index of the recording that each belongs to
     held_out: Mask  # (m,)
+    soaked: Mask  # (m,); whether each is a part of a soak
     span: Index  # (m, 2); its first sample, and the one after its last
     step: Values  # (m, 3), g or deg/s; of the readings on an axis whose noise is below half a step, else 0
     # (m, 3), deg/s; rate across gravity at which the unit tilts, by the readings of the accelerometer; 0 where it
@@ -175,10 +208,11 @@ class Rests:
     creep_error: Values  # (m,), deg/s; standard uncertainty of each of its two components
     creep_about: Values  # (m,), deg/s; standard deviation of the rate about gravity
     clock_shared: bool  # whether the time between the recordings is known
+    kinds: frozenset[str] = frozenset()  # of the recordings, in the sheet
 
     def select(self, index: Mask | slice) -> Self:
         """Return some of the rests."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "clock_shared"}
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in OF_ALL}
         return replace(self, **{name: values[index] for name, values in arrays.items()})
 
     def variance(self, white: Values) -> Values:
@@ -186,7 +220,7 @@ class Rests:
 
         In steps d that hide the noise a mean has the rounding error ``d / sqrt(12)``, however many readings it has.
         """
-        return np.asarray(self.share[:, None] * white**2 + self.step**2 / 12.0)
+        return np.asarray(self.share[:, None] * white**2 + self.step**2 / 12.0 + self.own[:, None])
 
     @property
     def white(self) -> Values:
@@ -252,7 +286,7 @@ def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, 
     step = coarse_of([_step_and_noise(r, sensor) for r in recordings if r.reading(sensor) is not None])
     columns["step"] = np.tile(step, (len(columns["time"]), 1))
     shared = len(np.unique(columns["recording"])) == 1 or all(recordings[index].clock_shared for index in chosen)
-    return Rests(**columns, clock_shared=shared)
+    return Rests(**columns, clock_shared=shared, kinds=frozenset(recordings[index].kind for index in chosen))
 
 
 @dataclass(frozen=True)
@@ -294,8 +328,8 @@ def orientations_of(recordings: Sequence[Recording], settings: Settings) -> Orie
             continue
         on_table = _rests_on_table(recording, settings.table)
         if on_table is None:
-            split = split_rests(recording, every if recording.role == ROLE else 0)
-            used[i] = split.used
+            split, soaked = split_rests(recording, every if recording.role == ROLE else 0), recording.kind == SOAK
+            used[i] = [split.used[nearest_to_reference(_warmth(recording, split.used))]] if soaked else split.used
             held_out += [(recording, rest) for rest in split.held_out]
             left_out += [(recording, rest) for rest in split.left_out]
         else:
@@ -329,25 +363,27 @@ def _of_recording(recording: Recording, sensor: str, rests: tuple[Rest, ...]) ->
     reading, good = np.asarray(recording.reading(sensor)), sound_samples(recording, sensor)
     inside = [slice(a, b) for a, b in span]
     scatter = [np.sum((reading[s][good[s]] - mean) ** 2, axis=0) for s, mean in zip(inside, means, strict=True)]
-    by_hand = recording.accelerometer is not None and recording.table_angle is None
+    by_hand = recording.accelerometer is not None and recording.table_angle is None and recording.kind != SOAK
     creeps = [creep_of_rest(recording, a, b) for a, b in span.tolist()] if by_hand else []
     rate, error, about = (
         posterior_creep_rates(creeps) if creeps else (np.zeros((len(span), 3)), np.zeros(len(span)), 0.0)
     )
     if sensor == "accelerometer" and by_hand:  # without the tilt of a unit that creeps
         scatter = [c.squares * max(n - 1, 1) / max(c.freedom, 1) for c, n in zip(creeps, counts, strict=True)]
-    warmth = np.full(recording.samples, np.nan) if recording.temperature is None else temperature_of(recording)
     start = time[span[:, 0]]
+    share, own = variances_of_means(recording, counts, sensor)
     return {
         "reading": means,
         "count": counts,
-        "share": variance_of_mean(filter_autocovariance(recording), counts) if len(counts) else np.zeros(0),
+        "share": share,
+        "own": own,
         "scatter": np.array(scatter).reshape(-1, 3),
         "start": start,
         "length": time[span[:, 1] - 1] - start + recording.interval,
         "time": np.array([time[s].mean() for s in inside]),
-        "temperature": np.array([warmth[s].mean() for s in inside]),
+        "temperature": _warmth(recording, [Rest(a, b) for a, b in span.tolist()]),
         "held_out": np.zeros(len(span), bool),
+        "soaked": np.full(len(span), recording.kind == SOAK),
         "span": span,
         "creep": rate,
         "creep_error": error,

@@ -53,7 +53,8 @@ if TYPE_CHECKING:
     from pipeline.records import UnitRecordings
     from pipeline.settings import DataSheet, Settings, Table
 
-FITTED = {"bias": ("bias_temperature", "bias_temperature_quadratic"), "scale_factor": ("scale_factor_temperature",)}
+OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic", "bias_temperature_cubic")
+FITTED = {"bias": OF_THE_BIAS, "scale_factor": ("scale_factor_temperature",)}
 BURSTS = "interval of bursts"
 GRAVITY_ON_EARTH = 0.0044  # relative: 9.7639 to 9.8337 m/s^2 (Hirt et al. 2013, GRL 40, 4279) against 9.80665 m/s^2
 IN_LOCAL_GRAVITY = (

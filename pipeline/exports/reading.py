@@ -268,8 +268,10 @@ def _calibration(
 def _thermal(sensor: str, polynomial: Values, notes: list[str]) -> list[FittedEffect]:
     """Return the effect of a bias that is a polynomial in T - 25 degC: coefficients (3, k)."""
     polynomial = np.where(np.abs(polynomial) > FORMAT_ROUNDING * np.abs(polynomial).max(), polynomial, 0.0)
-    if np.any(polynomial[:, 3:]):
-        notes.append(f"{sensor}: the bias beyond the second order of the temperature is left out")
+    if np.any(polynomial[:, 4:]):
+        notes.append(f"{sensor}: the bias beyond the third order of the temperature is left out")
+    if np.any(polynomial[:, 3:4]):
+        return [_fitted("bias_temperature_cubic", sensor, polynomial[:, 1:4].ravel())]
     if np.any(polynomial[:, 2:3]):
         return [_fitted("bias_temperature_quadratic", sensor, polynomial[:, 1:3].ravel())]
     return [_fitted("bias_temperature", sensor, polynomial[:, 1])] if np.any(polynomial[:, 1:2]) else []

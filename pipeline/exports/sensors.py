@@ -155,7 +155,7 @@ def _rms(values: Sequence[Any]) -> Any:  # noqa: ANN401  (numbers, or lists of t
     return np.sqrt(np.mean(np.square(values), axis=0)).tolist()
 
 
-OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic")
+OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic", "bias_temperature_cubic")
 TEMPERATURES = [-40.0, 85.0]  # degC, the widest specified range of such parts
 ORDER = 4  # coefficients of a polynomial of third order in the temperature
 
@@ -221,16 +221,17 @@ class ExportedSensor:
 
     @property
     def bias_polynomial(self) -> Values:
-        """Coefficients of the bias in powers 0 to 2 of T - 25 degC: (3, 3) array, one row per axis."""
-        polynomial = np.zeros((3, 3))
+        """Coefficients of the bias in powers 0 to 3 of T - 25 degC: (3, 4) array, one row per axis."""
+        polynomial = np.zeros((3, ORDER))
         polynomial[:, 0] = self.calibration.bias
         polynomial[:, 1] += self.effects.get("bias_temperature", np.zeros(3))
-        polynomial[:, 1:] += self.effects.get("bias_temperature_quadratic", np.zeros(6)).reshape(3, 2)
+        polynomial[:, 1:3] += self.effects.get("bias_temperature_quadratic", np.zeros(6)).reshape(3, 2)
+        polynomial[:, 1:] += self.effects.get("bias_temperature_cubic", np.zeros(9)).reshape(3, 3)
         return polynomial * self.factor
 
     def bias_at(self, temperature: float) -> Values:
         """Return the bias at a temperature, degC, in the unit of the format."""
-        return np.asarray(self.bias_polynomial @ (temperature - REFERENCE_TEMPERATURE) ** np.arange(3))
+        return np.asarray(self.bias_polynomial @ (temperature - REFERENCE_TEMPERATURE) ** np.arange(ORDER))
 
     @property
     def g_sensitivity(self) -> Values:
@@ -257,7 +258,7 @@ class ExportedSensor:
         offset = self.bias_polynomial
         added = np.zeros((3, ORDER))
         for i, power in enumerate(powers):
-            for j in range(min(3, ORDER - i)):
+            for j in range(ORDER - i):
                 added[:, i + j] -= power @ offset[:, j]
         return shifted(np.stack(powers, axis=2), REFERENCE_TEMPERATURE, 0.0), shifted(added, REFERENCE_TEMPERATURE, 0.0)
 
@@ -280,7 +281,7 @@ def shifted(coefficients: Values, before: float, after: float) -> Values:
 
 
 def before_use(document: dict[str, Any]) -> list[str]:
-    """Return remarks before the use of an export: conversion to body axes, priors of lots, implausible values."""
+    """Return remarks before the use of an export: conversion to body axes, what is not known by recordings, priors."""
     maps = maps_of_log(document.get("log") or {})
     owners = dict.fromkeys(maps.values(), "sensor") if len(set(maps.values())) == 1 else {m: s for s, m in maps.items()}
     lines = []
@@ -288,6 +289,7 @@ def before_use(document: dict[str, Any]) -> list[str]:
         if axis_map != STRAIGHT:
             pairs = ", ".join(f"{a} along body {b}" for a, b in zip("xyz", axis_map, strict=True))
             lines.append(f"Turn the readings to body axes first: the {sensor}'s {pairs}.")
+    lines += [f"{s}: {text}." for s in SENSORS if (text := (document.get(s) or {}).get("not_determined"))]
     for sensor, prior in (document.get("lot_prior") or {}).items():
         state = prior["refused"] or f"{prior['siblings']} siblings; held-out errors are those without it"
         lines.append(f"With{'out' if prior['refused'] else ''} the prior of {prior['lot']}, {sensor}: {state}.")

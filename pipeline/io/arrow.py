@@ -28,10 +28,21 @@ if TYPE_CHECKING:
 
 BLOCKS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE, "table_attitude": ATTITUDE}
 SINGLES = ("temperature", "table_angle", "table_rate", "flags")
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 ROW_GROUP = 1_000_000  # samples
 KEY = b"recordings"
-PLAIN = ("name", "role", "axis", "setup", "up", "sense", "source", "filter", "clock_shared")  # fields stored as JSON
+PLAIN = (
+    "name",
+    "role",
+    "axis",
+    "setup",
+    "kind",
+    "up",
+    "sense",
+    "source",
+    "filter",
+    "clock_shared",
+)  # fields stored as JSON
 TYPES = {"time_ns": "int64", **dict.fromkeys(CHANNELS, "float64"), "flags": "uint16"}
 PAGE_ENCODINGS = {"int64": "DELTA_BINARY_PACKED", "float64": "PLAIN", "uint16": "PLAIN"}
 

@@ -25,6 +25,7 @@ from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_re
 from pipeline.io.encoder_log import unwrapped
 from pipeline.io.files import candidate_files
 from pipeline.io.quality_flags import examine
+from pipeline.io.recordings_sheet import require_recordings
 from pipeline.records import Note, Recording, files_of_readings, rate_of_attitude
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ def read_recordings(
     by the name of its recording, read in place of files. Raises ``MissingInputError`` if
     files that are not optional do not exist, ``InputError`` if files cannot be used; one error lists all such files.
     """
+    require_recordings(procedure, folder)
     checks, layouts = checks_of(ingest), csv_formats(ingest) if ingest.csv else None
     found, missing = set[str](), list[str]()
     recordings: list[Recording] = []
@@ -73,7 +75,7 @@ def read_recordings(
             if name in in_memory:
                 table = imu_logs.read_canonical(f"{name} {IN_MEMORY}", in_memory[name], ingest)
             else:
-                table = read_table([folder / f for f in files], ingest, layouts, entry.session)
+                table = _table_of(entry, [folder / f for f in files], ingest, layouts, sensor)
             recording = to_recording(name, entry, table, sensor, checks)
         except IngestError as error:
             refused.append(error)
@@ -116,6 +118,17 @@ def read_table(
     for log in table.apart or (own_rows(table),):
         table = align(table, log)
     return replace(table, apart=())
+
+
+def _table_of(
+    entry: RecordingFile, paths: Sequence[Path], ingest: Ingest, layouts: Sequence[CsvFormat] | None, sensor: Sensor
+) -> Log:
+    """Read the file or files of one recording as its entry states."""
+    if entry.kind != "attitudes":
+        return read_table(paths, ingest, layouts, entry.session)
+    from pipeline.io.attitudes import read_attitudes  # noqa: PLC0415  (few units need it)
+
+    return read_attitudes(paths[0], layouts or (), sensor, checks_of(ingest))
 
 
 def _existing(candidates: Sequence[Sequence[str]], folder: Path) -> tuple[list[str], list[str], list[str]]:
@@ -182,6 +195,7 @@ def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | N
         role=entry.role,
         axis=entry.axis,
         setup=entry.setup or "",
+        kind=entry.kind or "",
         time_ns=table.time_ns,
         accelerometer=readings["accelerometer"],
         gyroscope=readings["gyroscope"],

@@ -431,13 +431,19 @@ def frame_words(part: Mapping[str, Any] | None) -> str:
 
 
 def not_determined(part: Mapping[str, Any]) -> str:
-    """Return which misalignments the rests do not determine, and which rests would; empty if all are determined."""
+    """Return which parameters the recordings do not determine, and which would; empty if all are determined."""
     lines = (part.get("uncertainty_budget") or {}).get("contributions") or []
     names = next((str(line["remark"]) for line in lines if line["source"] == LIMIT), "")
-    return names and (
-        f"the rests do not determine {names}, known by the limit of the sensor file alone: rest the unit in more "
-        "attitudes, also half-way between two axes"
-    )
+    if not names:
+        return ""
+    advice = "rest the unit in more attitudes, also half-way between two axes"
+    if "bias_" in names or "scale_factor_" in names:
+        advice = "rest the unit in more attitudes, each axis up and down, also half-way between two axes"
+    if "matrix_" in names:
+        about = [axis for axis in "xyz" if f"matrix_{axis}{axis}" in names]
+        turns = f"turn the unit about {' and '.join(about)} by a known angle, " if about else ""
+        advice = f"{turns}move it between rests in many attitudes, or state the axes of turns more accurately"
+    return f"the rests do not determine {names}, known by the limit of the sensor file alone: {advice}"
 
 
 def left_out(inputs: Sequence[Mapping[str, Any]] | None) -> list[str]:

@@ -39,7 +39,7 @@ from imu_logs.units import TRIADS
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.preprocessing.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, refusal
 from pipeline.records import SENSOR_UNITS, SENSORS, Note, median
-from pipeline.signal.rests import RATE_AT_REST_DPS, rests_from_table, runs
+from pipeline.signal.rests import RATE_AT_REST, RATE_AT_REST_DPS, rests_from_table, runs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -80,6 +80,22 @@ def check_static(recordings: Sequence[Recording], settings: Settings) -> list[Re
         _doubted(_resting(r, rests, sensor_model), recordings, rests, sensor_model) if r.role == "static" else r
         for r in recordings
     ]
+
+
+def with_rates_at_rest(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the recordings, those of turns (of a sheet) with the rate that the gyroscope reads in those at rest.
+
+    A slow turn about the vertical looks like a rest to the accelerometer.
+    """
+    at_rest = [
+        median(r.gyroscope[r.valid])
+        for r in recordings
+        if r.kind == "rest" and r.role != "validation" and r.gyroscope is not None and r.valid.any()
+    ]
+    if not at_rest:
+        return list(recordings)
+    usual = median(np.array(at_rest)).tolist()
+    return [replace(r, source={**r.source, RATE_AT_REST: usual}) if r.kind == "turn" else r for r in recordings]
 
 
 def _doubted(

@@ -23,7 +23,7 @@ import numpy as np
 from imu_logs.units import TRIADS
 from pipeline.io.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.model.kinematics import normal_gravity_g
-from pipeline.preprocessing.at_rest import check_axes, check_static
+from pipeline.preprocessing.at_rest import check_axes, check_static, with_rates_at_rest
 from pipeline.preprocessing.coarse_temperature import refined
 from pipeline.preprocessing.evidence import place, refusal
 from pipeline.preprocessing.mounting import check_mounting
@@ -65,7 +65,7 @@ def check_recordings(recordings: Sequence[Recording], settings: Settings) -> lis
     """
     _check_shared_rows(recordings)
     check_axes(recordings)
-    recordings = _with_steps(recordings)
+    recordings = _with_steps(with_rates_at_rest(recordings))
     turns, delays = check_turns(check_static(recordings, settings), settings)
     checked = refined(check_motion(check_mounting(turns, settings), delays, settings))
     return _placed(checked, settings.table)

@@ -58,7 +58,9 @@ from pipeline.records.parameters import (
     standard_uncertainty,
 )
 from pipeline.records.recording import (
+    BETWEEN_ATTITUDES_S,
     MEDIAN_SIZE,
+    NOISE_OF_ROWS,
     Motion,
     Noise,
     Recording,
@@ -91,6 +93,7 @@ __all__ = [
     "BASE",
     "BASE_COUNT",
     "BASE_NAMES",
+    "BETWEEN_ATTITUDES_S",
     "BIAS",
     "BIAS_NAMES",
     "LIMIT",
@@ -99,6 +102,7 @@ __all__ = [
     "MATRIX_ROWS",
     "MEDIAN_SIZE",
     "MONTE_CARLO",
+    "NOISE_OF_ROWS",
     "NORMAL",
     "READABLE_VERSIONS",
     "RECTANGULAR",

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pipeline.records.parameters import Parameters
 
 NORMAL, RECTANGULAR = "normal", "rectangular"
-LIMIT = "misalignment not determined by the rests: limit of the sensor file"  # a source of the uncertainty budget
+LIMIT = "not determined by the recordings: limit of the sensor file"  # a source of the uncertainty budget
 MONTE_CARLO = "monte_carlo"  # key of the run in a published budget
 
 

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 import numpy as np
 
 from imu_logs.units import SENSOR_UNITS
-from pipeline.records.budget import Budget, BudgetLine, finite, unlimited
+from pipeline.records.budget import LIMIT, Budget, BudgetLine, finite, unlimited
 from pipeline.records.correction import Step, published, steps_of
 from pipeline.records.parameters import (
+    BASE,
     BASE_NAMES,
     BIAS,
     Estimate,
@@ -27,7 +28,9 @@ from pipeline.records.parameters import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from imu_logs.log import Values
+    from numpy.typing import NDArray
+
+    from imu_logs.log import Mask, Values
 
 SCHEMA_VERSION = 2  # of published documents; the keys of each version are in pipeline/schemas
 READABLE_VERSIONS = (1, 2)  # a key that a document of version 1 lacks counts as null
@@ -117,6 +120,15 @@ class SensorCalibration:
         """The lines of the budget; empty without a budget."""
         return self.budget.lines if self.budget else ()
 
+    @property
+    def by_limit(self) -> Mask:
+        """Whether the sensor file's limit, and not the recordings, determines bias and matrix: (12,) array.
+
+        It causes more than half of the variance.
+        """
+        of_limit = sum(line.standard_uncertainty[BASE] ** 2 for line in self.lines if line.source == LIMIT)
+        return np.asarray(of_limit > 0.5 * np.diag(self.parameters.covariance)[BASE])
+
     def to_json(self) -> dict[str, Any]:
         """Return the part of ``calibrations/<unit>.json`` for this sensor."""
         parameters = self.parameters
@@ -127,6 +139,7 @@ class SensorCalibration:
             "matrix": self.matrix.tolist(),
             "standard_uncertainty": _shaped(standard),
             "expanded_uncertainty": _shaped(factors * standard),
+            "determined_by": _shaped(np.where(self.by_limit, "sensor_file", "recordings")),
             "coverage_factor": _shaped(factors),
             "degrees_of_freedom": self.degrees_of_freedom if np.isfinite(self.degrees_of_freedom) else None,
             "effective_degrees_of_freedom": finite(parameters.degrees_of_freedom),
@@ -188,6 +201,6 @@ def calibrated(fits: Mapping[str, Fit]) -> dict[str, SensorCalibration | None]:
     return {sensor: None if isinstance(fit, NotCalibrated) else fit for sensor, fit in fits.items()}
 
 
-def _shaped(values: Values) -> dict[str, Any]:
+def _shaped(values: NDArray[Any]) -> dict[str, Any]:
     """Return values of all parameters in the shapes of bias and matrix."""
     return {"bias": values[BIAS].tolist(), "matrix": matrix_of(values).tolist()}

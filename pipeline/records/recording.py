@@ -35,6 +35,8 @@ Quantity = TypeVar("Quantity")
 Arguments = ParamSpec("Arguments")
 
 NANOSECONDS = 1_000_000_000
+BETWEEN_ATTITUDES_S = 1000.0  # between the blocks of a file of attitudes, whose times are not known
+NOISE_OF_ROWS = "noise_of_rows"  # in the source of means: standard deviation of each by white noise, by sensor
 CLIPPED_OR_STUCK = 0b110  # bits 1 and 2 of ``Recording.flags``
 # Arrays of a recording with a row for each sample.
 OF_SAMPLES = (
@@ -70,6 +72,7 @@ class Recording:
     filter: dict[str, Any] = field(default_factory=lambda: {"name": "none", "delay_s": 0.0, "noise_gain": 1.0})
     clock_shared: bool = True  # whether the time between this recording and the unit's others is known
     setup: str = ""  # table, mounting or session of the recording; empty if the unit has only one
+    kind: str = ""  # in the sheet of the recordings (``pipeline.io.recordings_sheet``); empty without one
     # Body axis (+x, -z ..) that points up during a turn about a vertical axis; empty for other turns, where it follows
     # from the table's angle.
     up: str = ""

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records import Integers, Mask, Recording, Values, median, noise_of_steps, once
+from pipeline.records import BETWEEN_ATTITUDES_S, Integers, Mask, Recording, Values, median, noise_of_steps, once
 from pipeline.signal.filters import filter_autocovariance, stretch_starts
 from pipeline.signal.quiet_motion import RATE_LIMIT_DPS, counts_of, creep_of_rest, quiet_pieces, windows
 
@@ -53,6 +53,9 @@ SMALLEST_SCATTER_G2 = 3e-6  # 1 mg on each axis, so that a quiet sensor may sett
 SIGNIFICANT_REST_DEVIATIONS = 6.0  # standard deviations
 REST_EDGE_S, FEWEST_TO_SETTLE = 0.5, 6  # edge of a rest that may move, at most a third of it; samples that this needs
 SETTLED_DIFFERENCE_DEVIATIONS = 8.0  # of the noise between successive samples: white noise passes in 1e-14
+
+RATE_AT_REST = "rate_at_rest_dps"  # in the source of a turn: what the gyroscope reads in the recordings at rest
+SOAK_PARTS = 40  # of a soak: over a span of 80 degC, 2 degC each
 
 
 @dataclass(frozen=True)
@@ -111,8 +114,24 @@ def rests_from_table(recording: Recording) -> list[Rest]:
 def find_rests(recording: Recording) -> list[Rest]:
     """Find the rests of a hand-held recording from its readings, in order of time, each at least 1 s long.
 
-    A rest in which the sensor moved is marked as refused, with the reason.
+    A rest in which the sensor moved is marked as refused, with the reason. If a sheet states the kind of the recording,
+    ``rest`` is one rest, the longest or, if none is found, the whole; ``soak`` parts of equal length, in which the
+    temperature hardly changes; ``attitudes`` the blocks of its rows.
     """
+    if recording.kind == "soak":
+        edges = np.linspace(0, recording.samples, min(SOAK_PARTS, recording.samples) + 1).astype(int)
+        return [Rest(a, b) for a, b in pairwise(edges.tolist())]
+    if recording.kind == "attitudes":
+        starts = np.flatnonzero(np.diff(recording.time_ns) > 0.5 * BETWEEN_ATTITUDES_S * 1e9) + 1
+        return [Rest(a, b) for a, b in pairwise([0, *starts.tolist(), recording.samples])]
+    found = _rests_by_readings(recording)
+    if recording.kind != "rest":
+        return found
+    longest = max((r for r in found if r.accepted), key=lambda r: r.stop - r.start, default=None)
+    return [longest or Rest(0, recording.samples)]
+
+
+def _rests_by_readings(recording: Recording) -> list[Rest]:
     force = recording.accelerometer
     size = max(5, round(WINDOW_S / _interval(recording))) if recording.samples > 1 else 5
     if force is None or recording.samples < 2 * size:
@@ -213,22 +232,23 @@ def _turn(recording: Recording, rest: Rest) -> str:
 
 
 def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
-    """Compare the mean angular rate of each rest with the median of its neighbours in time.
+    """Compare the mean angular rate of each rest with the median of its neighbours in time, or with other recordings.
 
-    Not of all rests, because the bias changes with the temperature.
+    Not of all rests of a recording, because the bias changes with the temperature.
     """
     rate = recording.gyroscope
-    if rate is None or len(rests) < 3:
+    if rate is None or (len(rests) < 3 and RATE_AT_REST not in recording.source):
         return [""] * len(rests)
     parts = [rate[r.start : r.stop] for r in rests]
     means = np.array([part.mean(axis=0) for part in parts])
     reasons = []
     for i, part in enumerate(parts):
         first = int(np.clip(i - NEIGHBOUR_RESTS // 2, 0, max(len(rests) - NEIGHBOUR_RESTS, 0)))
-        off = float(np.max(np.abs(means[i] - median(means[first : first + NEIGHBOUR_RESTS]))))
+        usual = recording.source.get(RATE_AT_REST) or median(means[first : first + NEIGHBOUR_RESTS])
+        off = float(np.max(np.abs(means[i] - usual)))
         noise = float(np.max(part.std(axis=0))) / np.sqrt(len(part))
         reasons.append(
-            f"angular rate is {off:.2f} deg/s off that of its neighbours (limit {RATE_LIMIT_DPS:g} deg/s)"
+            f"angular rate is {off:.2f} deg/s off that of other rests (limit {RATE_LIMIT_DPS:g} deg/s)"
             if off > max(RATE_LIMIT_DPS, SIGNIFICANT_REST_DEVIATIONS * noise)
             else ""
         )

@@ -221,8 +221,7 @@ def gravity_direction(
         return {"reason": "no rest is held out"}
     rests, gravity = observed
     judged = replace(rests, held_out=~rests.held_out)
-    stated, whole = procedure.turns, role if role == HELD_OUT else ""
-    turns = turns_of(recordings, judged, accelerometer, stated, whole)[0] if stated else None
+    turns = turns_of(recordings, judged, accelerometer, procedure, role if role == HELD_OUT else "")
     model = GyroscopeModel(judged, moves_of(recordings, judged), gravity, noise, fewest=1, turns=turns)
     if model.moves is None:
         return {"reason": "no move is held out"}

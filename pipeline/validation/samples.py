@@ -32,13 +32,13 @@ import numpy as np
 
 from pipeline.estimation.gauss_markov import variance_of_average
 from pipeline.estimation.observations import filtered_motion
-from pipeline.estimation.rest_means import held_out_rests, rest_means, split_rests
+from pipeline.estimation.rest_means import held_out_rests, rest_means, split_rests, variances_of_means
 from pipeline.model.effects.base import truth
 from pipeline.model.effects.equations import shifted
 from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.model.measurement import linear_truth
 from pipeline.signal.encoder_rate import MIN_RATE_SAMPLES, EncoderRate, rate_by_angle
-from pipeline.signal.filters import filter_autocovariance, variance_of_mean
+from pipeline.signal.filters import filter_autocovariance
 from pipeline.signal.quiet_motion import creep_of_rest, posterior_creep_rates
 
 if TYPE_CHECKING:
@@ -166,9 +166,9 @@ class HeldOutCase:
             return None
         reading, counts = reading[counts > 0], counts[counts > 0]
         other, _ = rest_means(recording, rests, OTHER[sensor])
-        share = variance_of_mean(filter_autocovariance(recording), counts)
+        share, own = variances_of_means(recording, counts, sensor)
         averaged = variance_of_average(counts.astype(np.float64) * recording.interval, noise.correlation_time)
-        white = share[:, None] * noise.white**2
+        white = share[:, None] * noise.white**2 + own[:, None]
         if sensor == "gyroscope" and recording.accelerometer is not None:
             rate, unknown = _creep(recording, rests, other)
             reading, white = reading - rate, white + unknown

@@ -22,6 +22,7 @@ CONFIGS = Path(__file__).parents[2] / "configs" / "effect"
 BOTH = [
     "bias_temperature",
     "bias_temperature_quadratic",
+    "bias_temperature_cubic",
     "scale_factor_temperature",
     "warm_up",
     "scale_factor_asymmetry",

@@ -8,7 +8,8 @@ orientations need not be known. ``pipeline.estimation.multi_position`` has the e
 hand-held rests, the dwells of a table's stop-and-go turns, or the single samples of its continuous turns.
 
 If the orientations determine a misalignment worse than the sensor file does, as in six positions, it has a
-pseudo-observation by the file's limit, and the result states this. On a table the bias wander correlates the errors of
+pseudo-observation by the file's limit, and the result states this; with a sheet of recordings, bias and scale factors,
+too. On a table the bias wander correlates the errors of
 the rows; ``pipeline.estimation.engine`` gives the covariance.
 
 The start is the ellipsoid ``p . (x^2, y^2, z^2, 2xy, 2xz, 2yz, 2x, 2y, 2z) = 1``, that is ``y^T Q y + 2 h^T y = 1``. It
@@ -18,6 +19,7 @@ is linear in p; its centre is ``b = -Q^-1 h``, and ``L^T L = Q G^2 / (1 + b^T Q 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,8 +30,14 @@ from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE_SETTING, WanderPrior
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
-from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, AccelerometerModel, limit_of_misalignment
-from pipeline.estimation.multi_position.fit import FitByHand
+from pipeline.estimation.multi_position.accelerometer import (
+    KNOWN_BY_LIMIT,
+    PARAMETERS,
+    AccelerometerModel,
+    limit_of_misalignment,
+    limits_of_parameters,
+)
+from pipeline.estimation.multi_position.fit import FitByHand, with_limits
 from pipeline.estimation.multi_position.fit import fit as fit_model
 from pipeline.estimation.multi_position.model import NoiseHypothesis, State, prior_hypotheses
 from pipeline.estimation.multi_position.result import (
@@ -57,10 +65,8 @@ from pipeline.records import (
     AXES,
     BASE_COUNT,
     BIAS,
-    BIAS_NAMES,
     MATRIX,
     Estimate,
-    Mask,
     Multiply,
     Noise,
     NoMonteCarlo,
@@ -77,7 +83,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.records import UnitRecordings
-    from pipeline.settings import Settings
+    from pipeline.settings import DataSheet, Settings
 
 
 NAME = "nonlinear_least_squares"
@@ -87,9 +93,7 @@ TRIANGLE = slice(BIAS.stop, None)  # of the nine values: the elements of L; the 
 PLACE = np.arange(BASE_COUNT)[[*range(BIAS.stop), *(MATRIX.start + np.ravel_multi_index((ROWS, COLUMNS), (3, 3)))]]
 PLACED = np.eye(BASE_COUNT)[:, PLACE]
 ELEMENTS = [(AXES[i], AXES[j]) for i, j in zip(ROWS, COLUMNS, strict=True)]
-PARAMETER_NAMES = np.array(
-    [*BIAS_NAMES] + [f"scale_factor_{i}" if i == j else f"misalignment_{i}{j}" for i, j in ELEMENTS]
-)
+PARAMETER_NAMES = np.array(PARAMETERS)
 MISALIGNMENT = np.concatenate([np.zeros(3, bool), ROWS != COLUMNS])
 IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])  # the nine values of an ideal sensor
 # standard uncertainty, g or relative, beyond which a bias or scale factor is called undetermined
@@ -178,11 +182,16 @@ def _fit_triangular(
 ) -> SensorCalibration:
     data_sheet, gravity_g = settings.sensor.accelerometer, settings.table.gravity_g
     prior = wander_prior(recordings.noises["accelerometer"], data_sheet)
-    rows, limit = orientations_of(recordings.filtered, settings), limit_of_misalignment(data_sheet)
-    solved = _fit_determined(rows, gravity_g, prior, limit)
+    rows = orientations_of(recordings.filtered, settings)
+    if settings.procedure.sheet is None:
+        limit = limit_of_misalignment(data_sheet)
+        determined = partial(_fit_determined, gravity_g=gravity_g, prior=prior, limit=limit)
+    else:
+        determined = partial(_fit_partly, gravity_g=gravity_g, prior=prior, data_sheet=data_sheet)
+    solved = determined(rows)
     while refused := _outlier(rows, solved):
         rows = _without(rows, refused)
-        solved = _fit_determined(rows, gravity_g, prior, limit)
+        solved = determined(rows)
     fitted, before = solved.fit, SensorCalibration("accelerometer", stages=previous.stages if previous else ())
     if not rows.by_hand and solved.spare > 1:
         return _on_table(rows, solved, before, prior, settings)
@@ -218,11 +227,11 @@ def _fit_determined(rows: Orientations, gravity_g: float, prior: WanderPrior, li
             "least 6 orientations, each axis up and down, or better in 24 that are spread evenly"
         )
     try:
-        solved = _fitted(rows, gravity_g, prior, MISALIGNMENT, limit)
+        solved = _fitted(rows, gravity_g, prior, dict.fromkeys(PARAMETER_NAMES[MISALIGNMENT].tolist(), limit))
         # A variance of more than half that of the limit is mostly the limit's.
         by_limit = MISALIGNMENT & ((solved.uncertainty > limit * np.sqrt(0.5)) | (count < len(PARAMETER_NAMES)))
         if not np.array_equal(by_limit, MISALIGNMENT):
-            solved = _fitted(rows, gravity_g, prior, by_limit, limit)
+            solved = _fitted(rows, gravity_g, prior, dict.fromkeys(PARAMETER_NAMES[by_limit].tolist(), limit))
     except NotObservableError as lack:
         raise NotObservableError(
             f"the {count} orientations are too much alike: {lack.message} ({_unused(rows)}). Record rests "
@@ -240,6 +249,18 @@ def _fit_determined(rows: Orientations, gravity_g: float, prior: WanderPrior, li
     return solved
 
 
+def _fit_partly(rows: Orientations, gravity_g: float, prior: WanderPrior, data_sheet: DataSheet) -> _Solved:
+    """Fit the nine values, with the limit of each that the orientations determine worse."""
+    if len(rows.rests.time) == 0:
+        raise NotObservableError(f"no rest of the accelerometer was found: {_unused(rows)}")
+
+    def solve_with(held: Mapping[str, float]) -> tuple[_Solved, Values]:
+        solved = _fitted(rows, gravity_g, prior, held)
+        return solved, solved.uncertainty
+
+    return with_limits(dict(zip(PARAMETERS, limits_of_parameters(data_sheet).tolist(), strict=True)), solve_with)
+
+
 def _unused(rows: Orientations) -> str:
     """Return how many rests are not used, and why, as a clause."""
     left_out, held_out = len(rows.left_out), len(rows.held_out)
@@ -247,12 +268,11 @@ def _unused(rows: Orientations) -> str:
     return f"{left_out} rests were left out because the sensor moved, {held_out} are held out for validation{unless}"
 
 
-def _fitted(rows: Orientations, gravity_g: float, prior: WanderPrior, by_limit: Mask, limit: float) -> _Solved:
+def _fitted(rows: Orientations, gravity_g: float, prior: WanderPrior, limits: Mapping[str, float]) -> _Solved:
     """Fit the nine values; raise ``NotObservableError`` if orientations and limits do not determine them."""
     noise = Noise(rows.white, np.zeros(3), prior.time, "rests")
-    limits = dict.fromkeys(PARAMETER_NAMES[by_limit].tolist(), limit)
     model = AccelerometerModel(rows.rests, PLACED, gravity_g, noise, known_by_limit=limits, wander=rows.by_hand)
-    values = _start(rows.rests.reading, gravity_g, tilted=not by_limit.any())
+    values = _start(rows.rests.reading, gravity_g, tilted=not limits)
     state = State(values[BIAS], triangle(values))
     equations = model.equations(state)
     ScaledColumns.of(equations.base).require_full_rank(PARAMETER_NAMES.tolist())
@@ -265,8 +285,9 @@ def _fitted(rows: Orientations, gravity_g: float, prior: WanderPrior, by_limit: 
     ):  # too few rows to show a scatter: the prior of the wander replaces it
         white = float(np.median(equations.error[: model.rests_equations]))
         noises = [NoiseHypothesis(WHITE_SETTING, (prior.wander / white,))]
-    noises = [replace(noise, known=True) for noise in noises]  # by the scatter within the rests
-    fitted = fit_model(model, state, noises, {}, max(rows.rests.freedom, 1.0))
+    known_white = rows.rests.freedom > 0.0 or not np.any(rows.rests.own)  # by the scatter within the rests
+    noises = [replace(noise, known=known_white) for noise in noises]
+    fitted = fit_model(model, state, noises, {}, max(rows.rests.freedom, 1.0) if known_white else None)
     equations = model.equations(fitted.state)
     variance = np.diag(equations.covariance(fitted.noise)) if rows.by_hand else equations.variance(fitted.noise)
     return _Solved(model, fitted, equations.base / np.sqrt(variance)[:, None], 1.0 / np.sqrt(variance))

@@ -8,18 +8,20 @@ equations. Rests and moves are weighted by their scatter, and outlying moves hav
 
 from __future__ import annotations
 
+from copy import copy
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.least_squares import ScaledColumns
+from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.multi_position.effects import accelerometer_of
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
-from pipeline.estimation.multi_position.fit import fit_robustly
+from pipeline.estimation.multi_position.fit import fit_robustly, with_limits
 from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, MOVED, model_of
-from pipeline.estimation.multi_position.model import MIN_NEW_NORM_SHARE, State, prior_hypotheses
+from pipeline.estimation.multi_position.model import MIN_NEW_NORM_SHARE, ONE, State, prior_hypotheses
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise import wander_prior
@@ -28,8 +30,14 @@ from pipeline.estimation.stages import FitStage
 from pipeline.records import BASE_COUNT, MATRIX, MATRIX_NAMES, Multiply, SensorCalibration, StageResult, Subtract
 
 if TYPE_CHECKING:
-    from pipeline.records import UnitRecordings
-    from pipeline.settings import Settings
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.estimation.multi_position.fit import FitByHand
+    from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
+    from pipeline.records import Recording, UnitRecordings, Values
+    from pipeline.settings import DataSheet, Procedure, Settings
+
+    Found: TypeAlias = tuple[GyroscopeModel, FitByHand, list[dict[str, Any]]]
 
 NAME = "rests_and_moves"
 FIT_STAGES = {NAME: FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias", "matrix"), free=True)}
@@ -39,41 +47,48 @@ MAX_KNOWN_ELEMENT_UNCERTAINTY = 0.05
 RECORDING_ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 
+def _limits(data_sheet: DataSheet) -> dict[str, float]:
+    """Return the standard uncertainty of each element of the matrix, uniform within the sensor file's limits."""
+    limit = {True: data_sheet.scale_factor, False: data_sheet.cross_axis}
+    return {name: limit[name in ONE] / float(np.sqrt(3.0)) for name in MATRIX_NAMES}
+
+
 def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings) -> SensorCalibration:
     """Fit bias and matrix of the gyroscope (``pipeline.estimation.stages``).
 
     Role ``rests``, with the readings of the accelerometer, which is calibrated first. Raises ``CannotCalibrateError``
     also where moves and turns do not determine the matrix: the unit then keeps the calibration of its accelerometer.
     """
-    filtered, procedure = recordings.filtered, settings.procedure
-    if not is_multi_position("gyroscope", filtered):
-        raise CannotCalibrateError(
-            f"rests and moves need a recording by hand with the gyroscope's readings: {RECORDING_ADVICE}"
-        )
-    if not any(r.role == ROLE and r.accelerometer is not None for r in filtered):
-        raise CannotCalibrateError(
-            "rests and moves need the readings of both sensors: gravity before and after each move shows by how much "
-            "the unit turned. A gyroscope alone needs a rate table"
-        )
-    noise, advice = recordings.noises["gyroscope"], RECORDING_ADVICE + advice_on_held_out(filtered, procedure)
+    filtered, procedure, noise = recordings.filtered, settings.procedure, recordings.noises["gyroscope"]
+    _require_recordings(filtered, procedure)
     accelerometer = accelerometer_of(recordings, settings)
-    model = model_of(filtered, None, noise, procedure, accelerometer)
-    if model is None or (model.moves is None and model.turns is None):
+    data_sheet, sheet = settings.sensor.gyroscope, procedure.sheet is not None
+    limits = _limits(data_sheet) if sheet else {}
+    model = model_of(filtered, None, noise, procedure, accelerometer, known_by_limit=limits)
+    advice = RECORDING_ADVICE + advice_on_held_out(filtered, procedure)
+    if model is None or not (model.moves or model.turns or sheet):
         rests = rests_of("gyroscope", filtered, procedure)
         raise CannotCalibrateError(
             f"the gyroscope's matrix needs at least {MIN_MOVES} moves between rests, without gaps or clipped "
             f"readings{clipped_moves(filtered, rests) if rests else ''}: {advice}"
         )
+    noises = prior_hypotheses(wander_prior(noise, data_sheet), float(np.mean(model.white)), model.kinds)
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
-    base = model.equations(start).base
-    if ScaledColumns.of(base, MIN_NEW_NORM_SHARE).rank < base.shape[1]:
-        raise CannotCalibrateError(
-            f"the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: {advice}"
-        )
-    prior = wander_prior(noise, settings.sensor.gyroscope)
-    noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
     fit_model = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
-    model, fitted, outlying = fit_robustly(model, fit_model, filtered)
+
+    def fit_with(held: Mapping[str, float], whole: GyroscopeModel = model) -> tuple[Found, Values]:
+        part = copy(whole)
+        part.known_by_limit = held
+        base = part.equations(start).base
+        if ScaledColumns.of(base, MIN_NEW_NORM_SHARE).rank < base.shape[1]:
+            raise CannotCalibrateError(
+                "the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: "
+                f"{advice}"
+            )
+        found = fit_robustly(part, fit_model, filtered)
+        return found, np.sqrt(np.diag(found[1].covariance))[MATRIX]
+
+    model, fitted, outlying = with_limits(limits, fit_with) if sheet else fit_with({})[0]
     moved, faces = np.zeros(BASE_COUNT), procedure.faces
     for _ in range(MOVED_TIMES if faces and model.moves else 0):
         moved = model.accelerometer_errors(fitted)
@@ -81,12 +96,8 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
         assert model is not None  # noqa: S101
         model, fitted, outlying = fit_robustly(model, partial(fit_model, start=fitted.state), filtered)
     moves, u = model.moves.count if model.moves else 0, np.sqrt(np.diag(fitted.covariance))[MATRIX]
-    if np.any(u > MAX_KNOWN_ELEMENT_UNCERTAINTY):
-        weak = [name for name, one in zip(MATRIX_NAMES, u, strict=True) if one > MAX_KNOWN_ELEMENT_UNCERTAINTY]
-        raise CannotCalibrateError(
-            f"the {moves} moves are nearly degenerate: they leave {', '.join(weak)} open to {float(u.max()):.2g} "
-            f"(standard uncertainty), as if all were about one axis: {advice}"
-        )
+    if not sheet:
+        _require_known(u, moves, advice)
     apart = fitted.residual[model.of_moves] * fitted.error[model.of_moves]
     details: dict[str, Any] = {
         "rests": len(model.rests.time),
@@ -100,6 +111,8 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
         "condition": fitted.condition,
         "degrees_of_freedom": float(fitted.degrees_of_freedom.min()),
     }
+    if sheet:
+        details[KNOWN_BY_LIMIT] = dict(model.known_by_limit)
     if faces:
         details[MOVED] = moved.tolist()
     if model.turns is not None:
@@ -108,3 +121,26 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     stage = StageResult(NAME, correction=(Subtract(fitted.state.bias), Multiply(fitted.state.matrix)), details=details)
     before = SensorCalibration("gyroscope", stages=previous.stages if previous else ())
     return after_stage(before, stage, model, fitted, settings, other=accelerometer)
+
+
+def _require_recordings(recordings: Sequence[Recording], procedure: Procedure) -> None:
+    """Raise ``CannotCalibrateError`` without recordings by hand of both sensors; a sheet may lack the accelerometer."""
+    if not is_multi_position("gyroscope", recordings):
+        raise CannotCalibrateError(
+            f"rests and moves need a recording by hand with the gyroscope's readings: {RECORDING_ADVICE}"
+        )
+    if procedure.sheet is None and not any(r.role == ROLE and r.accelerometer is not None for r in recordings):
+        raise CannotCalibrateError(
+            "rests and moves need the readings of both sensors: gravity before and after each move shows by how much "
+            "the unit turned. A gyroscope alone needs a rate table, or turns by known angles (procedure listed)"
+        )
+
+
+def _require_known(u: Values, moves: int, advice: str) -> None:
+    """Raise ``CannotCalibrateError`` if the moves leave an element of the matrix open; ``u``: (9,)."""
+    if np.any(u > MAX_KNOWN_ELEMENT_UNCERTAINTY):
+        weak = [name for name, one in zip(MATRIX_NAMES, u, strict=True) if one > MAX_KNOWN_ELEMENT_UNCERTAINTY]
+        raise CannotCalibrateError(
+            f"the {moves} moves are nearly degenerate: they leave {', '.join(weak)} open to {float(u.max()):.2g} "
+            f"(standard uncertainty), as if all were about one axis: {advice}"
+        )

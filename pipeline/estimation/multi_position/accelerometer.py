@@ -8,15 +8,16 @@ where
     y   : (3,) mean reading of a rest, g; w s^2 its variance, s^2 that of a sample
     b, M: bias, g, and matrix ``M = Q L``: |f| determines the lower triangular L, but not the rotation Q, which is fixed
     z   : effects, at the force of the magnitude of gravity; p their parameters
-    s_e : standard deviation of |f|: ``s_e^2 = sum_c (M^T n)_c^2 (w s_c^2 + d_c^2 / 12)``, d coarse steps of readings
+    s_e : standard deviation of |f|: ``s_e^2 = sum_c (M^T n)_c^2 (w s_c^2 + v + d_c^2 / 12)``, d coarse steps of readings,
+          v the variance of a mean that was recorded as such, whose w is 0
 
 If the procedure states faces, their equations are added (``faces_and_turns``), and the full matrix is fitted. Otherwise
-a misalignment that the rests do not determine has a separate equation, a pseudo-observation of 0 with the standard
-uncertainty u from the sensor file's limit c of the cross-axis sensitivity:
+a misalignment that the rests do not determine is known by the sensor file's limit c of the cross-axis sensitivity:
 
-    r = (0 - L_ij) / u,   u = sqrt(2 / 3) c
+    L_ij = 0 +- u,   u = sqrt(2 / 3) c
 
-because L_ij is the angle between two axes, the sum of their two cross-axis sensitivities, both uniform within c.
+because L_ij is the angle between two axes, the sum of their two cross-axis sensitivities, both uniform within c. With a
+sheet of recordings the same holds for bias and scale factors, uniform within their limits.
 """
 
 from __future__ import annotations
@@ -32,11 +33,13 @@ from pipeline.estimation.multi_position.model import (
     Equations,
     State,
     effect_readings,
+    limit_block,
     motion_of,
     stacked,
 )
+from pipeline.estimation.multi_position.soaks import Soaks, parted
 from pipeline.estimation.rest_means import HELD_OUT, Rests, rests_of
-from pipeline.records import BASE_COUNT, base_values
+from pipeline.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -48,21 +51,25 @@ if TYPE_CHECKING:
 FORCE_ITERATIONS = 12  # of effects that depend on the force
 SETTLED_FORCE_G = 1e-12  # g
 SMALLEST_NOISE = 1e-9  # g
-KNOWN_BY_LIMIT = "known_by_limit"  # in the details of a stage: misalignments with a pseudo-observation, each with its u
-MATRIX_COLUMN = {"misalignment_yx": 4, "misalignment_zx": 6, "misalignment_zy": 7}  # of b and the lower triangle of L
+KNOWN_BY_LIMIT = "known_by_limit"  # in the details of a stage: parameters with a pseudo-observation, each with its u
+# Of b and the lower triangle of L.
+PARAMETERS = (
+    "bias_x", "bias_y", "bias_z", "scale_factor_x", "misalignment_yx", "scale_factor_y", "misalignment_zx",
+    "misalignment_zy", "scale_factor_z",
+)  # fmt: skip
 
 
 class AccelerometerModel:
     """Equations of the accelerometer's rests.
 
     ``rests``: rests of the fit. ``directions``: (12, b), change of bias and matrix by each base parameter. ``held``:
-    held-out rests. ``faces``: of ``rests``, if they are stated: the full matrix is then free. ``known_by_limit``:
-    misalignments with a pseudo-observation, each with its u. ``wander``: whether the equations include the errors by a
-    Gauss-Markov bias.
+    held-out rests. ``soaks``: further parts of soaks. ``faces``: of ``rests``, if they are stated: the full matrix is
+    then free. ``known_by_limit``: parameters with a pseudo-observation, each with its u. ``wander``: whether the
+    equations include the errors by a Gauss-Markov bias.
     """
 
     sensor = "accelerometer"
-    kinds = 1
+    kinds, between = 1, 0.0
 
     def __init__(
         self,
@@ -75,8 +82,10 @@ class AccelerometerModel:
         faces: Faces | None = None,
         known_by_limit: Mapping[str, float] | None = None,
         wander: bool = True,
+        soaks: Soaks | None = None,
     ) -> None:
         self.rests, self.gravity, self.held, self.faces = rests, gravity_g, held, faces
+        self.soaks = soaks
         self.noise = noise
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
         self.directions = directions if faces is None else np.eye(BASE_COUNT)
@@ -93,7 +102,7 @@ class AccelerometerModel:
         along = n @ state.matrix
         variance = rests.variance(self.white)
         error = np.sqrt(np.sum(along**2 * variance, axis=1))
-        target = np.sqrt(self.gravity**2 + 2.0 * rests.share * np.mean(self.white**2))
+        target = np.sqrt(self.gravity**2 + 2.0 * (rests.share * np.mean(self.white**2) + rests.own))
         motion = self._motion(self.gravity * n, rests)
         base = np.concatenate([-along, (n[:, :, None] * v[:, None, :]).reshape(-1, 9)], axis=1)
 
@@ -112,15 +121,13 @@ class AccelerometerModel:
             scattered=True,
         )
         if self.faces is None:
-            u = np.array(list(self.known_by_limit.values()))
-            angles = self.directions[:, [MATRIX_COLUMN[name] for name in self.known_by_limit]].T
-            of_limits = EquationBlock(
-                -angles @ base_values(state.bias, state.matrix) / u,
-                angles / u[:, None],
-                lambda term: np.zeros((len(u), len(term.values))),
-                self.gravity * u,
-            )
-            return stacked([of_rests, of_limits], self, state, candidates)
+            columns = self.directions[:, [PARAMETERS.index(name) for name in self.known_by_limit]].T
+            of_limits = limit_block(self.known_by_limit, columns, state, self.gravity)
+            blocks = [of_rests]
+            if self.soaks is not None:
+                of_references = self.specific_force(state, self.soaks.reference)[0]
+                blocks.append(self.soaks.equations(state, of_references, self.white))
+            return stacked([*blocks, of_limits], self, state, candidates)
         W = self.faces.weights() / self.gravity
         WM = W @ state.matrix
         wide = np.sqrt(self.faces.error**2 + np.einsum("rmc,mc->r", WM**2, variance))
@@ -147,6 +154,12 @@ class AccelerometerModel:
                 break
         return force, v
 
+    @property
+    def temperature(self) -> Values:
+        """Temperatures of all equations, degC."""
+        parts = [self.rests, *([self.soaks.rests] if self.soaks else [])]
+        return np.concatenate([part.temperature for part in parts])
+
     def samples(self) -> float:
         """Return the number of samples in the equations."""
         return float(self.rests.count.sum())
@@ -168,6 +181,7 @@ class AccelerometerModel:
             held=self.rests.select(held),
             faces=self.faces and self.faces.select(~held),
             known_by_limit=self.known_by_limit,
+            soaks=self.soaks,
         )
 
     def _motion(self, force: Values, rests: Rests) -> Motion:
@@ -179,6 +193,17 @@ def white_of(rests: Rests, noise: Noise | None) -> Values:
     if noise is not None and np.all(np.isfinite(noise.white)) and np.all(noise.white > 0):
         return noise.white
     return rests.white
+
+
+def limits_of_parameters(data_sheet: DataSheet) -> Values:
+    """Return u of each of ``PARAMETERS`` by the sensor file's limits: (9,) array.
+
+    ``data_sheet``: of the accelerometer.
+    """
+    uniform = {"bias": data_sheet.bias, "scale_factor": data_sheet.scale_factor}
+    angle = limit_of_misalignment(data_sheet)
+    limits = [uniform.get(name[:-2]) for name in PARAMETERS]
+    return np.array([angle if limit is None else limit / np.sqrt(3.0) for limit in limits])
 
 
 def limit_of_misalignment(data_sheet: DataSheet) -> float:
@@ -208,8 +233,10 @@ def model_of(
         return None
     gravity = settings.table.gravity_g
     held = rests_of("accelerometer", recordings, settings.procedure, role=HELD_OUT) or rests.select(rests.held_out)
-    used = rests.select(~rests.held_out)
+    used, soaks = parted(rests.select(~rests.held_out))
     faces = faces_of(used, (used.reading - calibration.bias) @ calibration.matrix.T, settings.procedure.faces)
     by_limit = {name: u for stage in calibration.stages for name, u in stage.details.get(KNOWN_BY_LIMIT, {}).items()}
     directions = _directions(calibration)
-    return AccelerometerModel(used, directions, gravity, noise, held=held, faces=faces, known_by_limit=by_limit)
+    return AccelerometerModel(
+        used, directions, gravity, noise, held=held, faces=faces, known_by_limit=by_limit, soaks=soaks
+    )

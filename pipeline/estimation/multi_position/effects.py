@@ -24,11 +24,14 @@ if TYPE_CHECKING:
     from pipeline.settings import Settings
 
 
-def accelerometer_of(recordings: UnitRecordings, settings: Settings) -> SensorCalibration:
+def accelerometer_of(recordings: UnitRecordings, settings: Settings) -> SensorCalibration | None:
     """Return the given calibration of the accelerometer (``method.given``), else calibrate it.
 
-    Raises ``CannotCalibrateError`` if that fails.
+    Raises ``CannotCalibrateError`` if that fails. None for a sheet of recordings without its readings.
     """
+    known = any(r.role == ROLE and r.accelerometer is not None for r in recordings.filtered)
+    if settings.procedure.sheet and not known and not is_given("accelerometer", settings.method):
+        return None
     try:
         if is_given("accelerometer", settings.method):
             return given_calibration("accelerometer", settings.method)

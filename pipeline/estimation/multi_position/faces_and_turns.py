@@ -7,11 +7,12 @@
 where
 
     f_k   : specific force of the rests with face f up; E_f: two directions across the axis of the face
-    Phi_k : integral of the calibrated rate over a turn, in the body's axes; A_k its stated total angle, about axis a
+    Phi_k : integral of the calibrated rate over a turn, in the body's axes; A_k its stated total angle, about e_a
     s     : standard uncertainties: of a face's mean rest, of a turn's angle, and of the mean direction of the turns
             about an axis. They include errors common to all rests on a face, or turns about an axis, which no mean
             reduces
 
+The bias wanders between rests and turns, and differs between recordings: turns have the columns H of ``model``.
 For a turn about a fixed axis Phi is angle times axis; a wobble of the axis by w rad changes its length by w^2 / 2. Both
 sensors then refer to the case. Source: F. Ferraris, U. Grimaldi & M. Parvis, Procedure for effortless in-field
 calibration of three-axial rate gyro and accelerometers, Sensors and Materials 7 (1995), 311-330.
@@ -24,22 +25,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.errors import NotObservableError
 from pipeline.estimation.multi_position.model import EquationBlock, State, effect_readings, motion_of
-from pipeline.estimation.multi_position.moves import padded, sound_span, spans_between, trapezoids
+from pipeline.estimation.multi_position.moves import padded, tangents, trapezoids
+from pipeline.estimation.multi_position.stated_turns import name_of_axis, stated_turns
 from pipeline.estimation.rest_means import ROLE, Rests
 from pipeline.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, Values
-from pipeline.signal.segments import MAX_AXIS_SINE, multiples
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.estimation.design import EffectColumns
+    from pipeline.estimation.multi_position.stated_turns import StatedTurn
     from pipeline.settings import FacesByHand as StatedFaces
-    from pipeline.settings import HandTurns
+    from pipeline.settings import HandTurns, Procedure
 
 NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip askew in its case, and a hand
 DEPARTS = 4.5  # standard uncertainties: two angles exceed it with a probability of 4e-5
+ONE_LINE = 1.0 - 1e-9  # cosine of the angle between axes that are stated as the same
 FACES = [f"{sign}{axis}" for axis in AXES for sign in "+-"]
 
 
@@ -96,8 +99,10 @@ class TurnsByHand:
     """The samples of t turns of a stated total angle, padded to the longest, and their equations."""
 
     name: tuple[str, ...]  # of each turn's recording
-    axis: Index  # (t,)
-    stated: Values  # (t,), deg; total angle
+    recording: Index  # (t,); its index
+    direction: Values  # (t, 3); stated unit vector of the axis
+    group: Index  # (t,); turns about one axis, in either direction, have the same number
+    stated: Values  # (t,), deg; total angle about the direction
     # each (t, s, 3), deg/s and g; angular rate as it was read; specific force by the calibrated accelerometer
     reading: Values
     force: Values
@@ -114,10 +119,10 @@ class TurnsByHand:
         """Return the equations; ``white`` (3,) is the noise of a sample."""
         WM = self.rows @ state.matrix
         motion, v = self._samples(state)
-        total = np.einsum("ts,tsi->ti", self.weight, v)
+        total, length = np.einsum("ts,tsi->ti", self.weight, v), self.weight.sum(axis=1)
         noise = np.einsum("rtc,c,t->r", WM**2, white**2, np.sum(self.weight**2, axis=1))
         error = np.sqrt(self.error**2 + noise)
-        bias = -np.einsum("rtc,t->rc", WM, self.weight.sum(axis=1))
+        bias = -np.einsum("rtc,t->rc", WM, length)
         matrix = np.einsum("rti,tj->rij", self.rows, total).reshape(-1, 9)
 
         def columns(term: EffectColumns) -> Values:
@@ -125,20 +130,27 @@ class TurnsByHand:
             return np.asarray(-np.einsum("rtc,ts,tscp->rp", WM, self.weight, Z) / error[:, None])
 
         residual = (self.value - np.einsum("rtc,tc->r", WM, total)) / error
-        return EquationBlock(residual, np.concatenate([bias, matrix], axis=1) / error[:, None], columns, error)
+        return EquationBlock(
+            residual,
+            np.concatenate([bias, matrix], axis=1) / error[:, None],
+            columns,
+            error,
+            np.einsum("rtc,t,c->crt", -WM, length, white) / error[:, None],
+            (self.time[:, 0], self.time[:, -1] - self.time[:, 0], self.recording),
+        )
 
     def described(self, state: State) -> list[dict[str, Any]]:
         """Return recording, start in s, axis, stated and calibrated total angle in deg of each turn."""
-        angles = self._angles(state)
+        angles = self._about(state)
         return [
             {
                 "recording": self.name[t],
                 "time_s": float(self.time[t, 0]),
-                "axis": AXES[axis],
+                "axis": name_of_axis(direction),
                 "stated_deg": float(self.stated[t]),
-                "angle_deg": float(angles[t, axis]),
+                "angle_deg": float(angles[t]),
             }
-            for t, axis in enumerate(self.axis.tolist())
+            for t, direction in enumerate(self.direction)
         ]
 
     def departures(self, state: State) -> list[str]:
@@ -150,9 +162,10 @@ class TurnsByHand:
             for t in range(count)
         ]
         across = np.linalg.norm(off[count:].reshape(-1, 2), axis=1)
+        first = [name_of_axis(self.direction[self.group == group][0]) for group in np.unique(self.group)]
         turned += [
-            (f"the axis of the turns about {AXES[axis]} is", angle, self.error[-1], "axis_accuracy_deg")
-            for axis, angle in zip(np.unique(self.axis), across, strict=True)
+            (f"the axis of the turns about {axis} is", angle, self.error[-1], "axis_accuracy_deg")
+            for axis, angle in zip(first, across, strict=True)
         ]
         return [
             f"{what} {angle:.1f} deg off, {angle / error:.1f} times procedure.turns.{name}"
@@ -163,6 +176,10 @@ class TurnsByHand:
     def _angles(self, state: State) -> Values:
         """Return Phi: (t, 3) array, deg."""
         return np.asarray(np.einsum("ts,tsi->ti", self.weight, self._samples(state)[1]) @ state.matrix.T)
+
+    def _about(self, state: State) -> Values:
+        """Return the angle of each turn about its direction: (t,) array, deg."""
+        return np.asarray(np.sum(self._angles(state) * self.direction, axis=1))
 
     def _samples(self, state: State) -> tuple[Motion, Values]:
         """Return the motion of all samples, and ``v = y - b - z``."""
@@ -175,56 +192,50 @@ class TurnsByHand:
 def turns_of(
     recordings: Sequence[Recording],
     rests: Rests,
-    accelerometer: SensorCalibration,
-    turns: HandTurns,
+    accelerometer: SensorCalibration | None,
+    procedure: Procedure,
     role: str = ROLE,
-) -> tuple[TurnsByHand | None, list[tuple[Recording, float, Values]]]:
-    """Return the moves that are turns by a multiple of the stated angle, and all moves.
+) -> TurnsByHand | None:
+    """Return the turns of a stated angle; None if there are none.
 
-    A move is from one rest to the next of its recording. A recording that the procedure states as a turn about an axis
-    is one move if it has no move between two rests.
-
-    ``rests``: all rests of the gyroscope; a move that ends at a held-out rest is not used. ``turns``: section
-    ``procedure.turns``. ``role``: of the recordings that may be one turn; empty for none. A move is its recording,
-    start in s and integrated readings in deg.
+    ``rests``: all rests of the gyroscope. ``role``: of the recordings that may be one turn; empty for none.
     """
-    spans = [(int(rests.recording[j]), span) for _, j, span in spans_between(rests) if not rests.held_out[j]]
-    bounded = {index for index, _ in spans}
-    spans += [
-        (index, slice(0, r.samples))
-        for index, r in enumerate(recordings)
-        if r.axis is not None and r.role == role and r.gyroscope is not None and index not in bounded
+    chosen = stated_turns(recordings, rests, procedure, role)
+    return _gathered(recordings, chosen, accelerometer, procedure.turns) if chosen and procedure.turns else None
+
+
+def _gathered(
+    recordings: Sequence[Recording],
+    chosen: Sequence[StatedTurn],
+    accelerometer: SensorCalibration | None,
+    turns: HandTurns,
+) -> TurnsByHand:
+    """Return the samples of turns, and their equations."""
+    pairs = [(recordings[t.recording], at) for t, at in zip(chosen, padded([t.span for t in chosen]), strict=True)]
+    force = [
+        np.zeros((len(at), 3))
+        if accelerometer is None or r.accelerometer is None
+        else (r.accelerometer[at] - accelerometer.bias) @ accelerometer.matrix.T
+        for r, at in pairs
     ]
-    bias = np.average(rests.reading, axis=0, weights=rests.count)
-    moves, chosen, multiple = [], [], []
-    for recording, span in ((recordings[index], span) for index, span in spans):
-        if sound_span(recording, span):
-            rate, time = np.asarray(recording.gyroscope)[span] - bias, recording.time[span]
-            angle = np.asarray(np.trapezoid(rate, time, axis=0), np.float64)
-            axis, count = multiples(angle, turns.angle_deg)
-            moves.append((recording, float(time[0]), angle))
-            if count:
-                chosen.append((recording, span))
-                multiple.append((axis, count))
-    if not chosen:
-        return None, moves
-    axes, counts = np.array(multiple).T
-    stated, number = counts * turns.angle_deg, len(chosen)
-    pairs = [(r, at) for (r, _), at in zip(chosen, padded([span for _, span in chosen]), strict=True)]
-    force = [(np.asarray(r.accelerometer)[at] - accelerometer.bias) @ accelerometer.matrix.T for r, at in pairs]
     warmth = [np.full(len(at), np.nan) if r.temperature is None else r.temperature[at] for r, at in pairs]
     times = np.array([r.time[at] for r, at in pairs])
-    rows = [np.outer(turn, np.eye(3)[axis]) for turn, axis in zip(np.eye(number), axes, strict=True)]
-    value, error = stated.tolist(), number * [turns.accuracy_deg]
-    for axis in np.unique(axes):
-        signed = np.where(axes == axis, np.sign(stated), 0.0)
-        share = np.degrees(signed / np.sum(signed * stated))
-        rows += [share[:, None] * e for i, e in enumerate(np.eye(3)) if i != axis]
+    direction, stated = np.array([t.direction for t in chosen]), np.array([t.angle for t in chosen])
+    cosine = direction @ direction.T
+    group = np.argmax(np.abs(cosine) > ONE_LINE, axis=1)
+    rows = [np.outer(turn, e) for turn, e in zip(np.eye(len(chosen)), direction, strict=True)]
+    value, error = stated.tolist(), [t.error for t in chosen]
+    for first in np.unique(group):
+        signed = np.where(group == first, np.sign(stated * cosine[first]), 0.0)
+        share = np.degrees(signed / np.sum(signed * stated * cosine[first]))
+        rows += [share[:, None] * e for e in across_axis(direction[first])]
         value += [0.0, 0.0]
         error += 2 * [turns.axis_accuracy_deg]
     return TurnsByHand(
-        name=tuple(r.name for r, _ in chosen),
-        axis=axes,
+        name=tuple(r.name for r, _ in pairs),
+        recording=np.array([t.recording for t in chosen]),
+        direction=direction,
+        group=group,
         stated=stated,
         reading=np.array([np.asarray(r.gyroscope)[at] for r, at in pairs]),
         force=np.array(force),
@@ -234,35 +245,10 @@ def turns_of(
         rows=np.array(rows),
         value=np.array(value),
         error=np.array(error),
-    ), moves
-
-
-def require_turns(
-    found: TurnsByHand | None, moves: Sequence[tuple[Recording, float, Values]], turns: HandTurns
-) -> None:
-    """Raise ``CannotCalibrateError`` if an axis has no stated turn, or a recording of a turn has another turn."""
-    expected = f"a multiple of {turns.angle_deg:g} deg, within a tenth of it and a quarter of that angle"
-    advice = (
-        "turn the unit from rest to rest about each body axis, and state the angle in procedure.turns.angle_deg; an "
-        "angle that is wrong in all turns shows a wrong unit or range of the gyroscope"
     )
 
-    def in_words(angle: Values) -> str:
-        return "(" + ", ".join(f"{a:.1f}" for a in angle) + ") deg about x, y, z"
 
-    pairs = [] if found is None else [(name, AXES[axis]) for name, axis in zip(found.name, found.axis, strict=True)]
-    for part in {id(r): r for r, _, _ in moves if r.axis is not None}.values():
-        if (part.name, str(part.axis)) not in pairs:
-            seen = ", ".join(in_words(angle) for r, _, angle in moves if r is part)
-            raise CannotCalibrateError(
-                f"recording {part.name} is no turn about {part.axis} by {expected}: the readings show {seen}; {advice}",
-                part.source.get("file"),
-            )
-    for axis, name in enumerate(AXES):
-        if name not in {turned for _, turned in pairs}:
-            about = [m for m in moves if np.linalg.norm(np.delete(m[2], axis)) < MAX_AXIS_SINE * abs(m[2][axis])]
-            largest = max(about, key=lambda m: abs(m[2][axis]), default=None)
-            seen = f"{in_words(largest[2])} at {largest[1]:.1f} s of {largest[0].name}" if largest else "none"
-            raise CannotCalibrateError(
-                f"there is no turn about {name} by {expected}; the largest about {name} is {seen}: {advice}"
-            )
+def across_axis(direction: Values) -> Values:
+    """Return two unit vectors across a direction, body axes where it is one: (2, 3) array."""
+    axis = int(np.argmax(np.abs(direction)))
+    return np.delete(np.eye(3), axis, axis=0) if abs(direction[axis]) == 1.0 else tangents(direction[None])[0]

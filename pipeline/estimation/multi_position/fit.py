@@ -29,11 +29,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from pipeline.errors import NotObservableError
+from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
 from pipeline.estimation.engine import ErrorMixture
@@ -52,10 +52,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
-    from pipeline.records import Recording, Values
+    from pipeline.records import Mask, Recording, Values
 
     Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
 
+Fitted = TypeVar("Fitted")
 MAX_GAUSS_NEWTON_ITERATIONS = 60  # of Gauss-Newton
 SMALL_LAST_STEP = 3e-3  # of a standard uncertainty: the last step taken
 STALLED = 0.1  # of a standard uncertainty: a fit whose steps stay larger has not converged
@@ -300,6 +301,34 @@ def require_observable(model: Model, fitted: FitByHand, limits: Limits) -> None:
             f"the rests of the {model.sensor} do not determine {', '.join([e.name for e in lost] or loose)}: {advice}; "
             f"or take it out of effects.{model.sensor}"
         )
+
+
+def with_limits(
+    limits: Mapping[str, float], solve_with: Callable[[Mapping[str, float]], tuple[Fitted, Values]]
+) -> Fitted:
+    """Fit with pseudo-observations of those parameters that the recordings determine worse than the sensor file.
+
+    A parameter keeps its pseudo-observation where its variance is more than half of that of its limit: it is then
+    mostly the limit's. ``limits``: name to standard uncertainty. ``solve_with``: fits with some of them, and returns
+    the fit and the standard uncertainties of all; raises an error if they leave a combination open.
+    """
+    u = np.array(list(limits.values()))
+
+    def held(kept: Mask) -> Mapping[str, float]:
+        return {name: limit for name, limit, k in zip(limits, u.tolist(), kept, strict=True) if k}
+
+    every, known = solve_with(held(np.ones(len(u), bool)))
+    kept = known > u * np.sqrt(0.5)
+    while not kept.all():
+        try:
+            found, known_now = solve_with(held(kept))
+        except (NotObservableError, CannotCalibrateError):
+            known_now = known
+        else:
+            if not np.any(~kept & (known_now > u * np.sqrt(0.5))):
+                return found
+        kept[int(np.argmax(np.where(kept, 0.0, known_now / u)))] = True
+    return every
 
 
 def fit_robustly(

@@ -33,13 +33,14 @@ import scipy
 
 from pipeline.estimation.engine import draw_normal
 from pipeline.estimation.least_squares import cholesky
-from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
-from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, require_turns, turns_of
+from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, SMALLEST_NOISE, white_of
+from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, turns_of
 from pipeline.estimation.multi_position.model import (
     EquationBlock,
     Equations,
     State,
     effect_readings,
+    limit_block,
     motion_of,
     stacked,
 )
@@ -52,7 +53,7 @@ from pipeline.estimation.multi_position.moves import (
     to_the_end,
 )
 from pipeline.model.kinematics import skew
-from pipeline.records import BASE, BASE_COUNT, BIAS, MATRIX
+from pipeline.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -75,11 +76,11 @@ class GyroscopeModel:
     """Equations of the gyroscope's rests and moves.
 
     ``rests``: all, also held-out ones, at which a move may begin. ``gravity``: at each rest, by the accelerometer.
-    ``fewest``: smallest number of moves that are used. ``turns``: of a stated total angle.
+    ``fewest``: smallest number of moves that are used. ``turns``: of a stated total angle. ``known_by_limit``: elements
+    of the matrix with a pseudo-observation, each with its u. ``between``: see ``model``.
     """
 
     sensor = "gyroscope"
-    known_by_limit: Mapping[str, float] = {}  # see the accelerometer's model
 
     def __init__(
         self,
@@ -90,13 +91,17 @@ class GyroscopeModel:
         *,
         fewest: int = MIN_MOVES,
         turns: TurnsByHand | None = None,
+        known_by_limit: Mapping[str, float] | None = None,
+        between: float = 0.0,
     ) -> None:
         self.every, self.at_rests, self.noise, self.fewest = rests, gravity, noise, fewest
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
         self.rests, self.force = rests.select(~rests.held_out), gravity.force[~rests.held_out]
         self.moves, self.turns = moves if moves is not None and moves.count >= fewest else None, turns
+        self.known_by_limit, self.between = known_by_limit or {}, between
         self.kinds = 1 if self.moves is None else 2
-        self.directions = np.eye(BASE_COUNT)[:, BIAS if self.moves is None and turns is None else BASE]
+        free = self.moves is not None or turns is not None or bool(known_by_limit)
+        self.directions = np.eye(BASE_COUNT)[:, BASE if free else BIAS]
         self.rests_equations = 3 * len(self.rests.time)
         self.of_moves = slice(self.rests_equations, self.rests_equations + (2 * self.moves.count if self.moves else 0))
         self.gravity = float(np.median(np.linalg.norm(gravity.force, axis=1)))
@@ -111,7 +116,15 @@ class GyroscopeModel:
             blocks.append(self._of_moves(state))
         if self.turns is not None:
             blocks.append(self.turns.equations(state, self.white))
+        if self.known_by_limit:
+            columns = np.eye(BASE_COUNT)[[BASE_NAMES.index(name) for name in self.known_by_limit]]
+            blocks.append(limit_block(self.known_by_limit, columns, state))
         return stacked(blocks, self, state, candidates)
+
+    @property
+    def temperature(self) -> Values:
+        """Temperatures of the rests, degC."""
+        return self.rests.temperature
 
     def samples(self) -> float:
         """Return the number of samples in the equations."""
@@ -140,7 +153,16 @@ class GyroscopeModel:
         out[~self.every.held_out] = held
         moves = None if self.moves is None else self.moves.select(~out[self.moves.after])
         rests = replace(self.every, held_out=out)
-        part = GyroscopeModel(rests, moves, self.at_rests, self.noise, fewest=self.fewest, turns=self.turns)
+        part = GyroscopeModel(
+            rests,
+            moves,
+            self.at_rests,
+            self.noise,
+            fewest=self.fewest,
+            turns=self.turns,
+            known_by_limit=self.known_by_limit,
+            between=self.between,
+        )
         part.kinds = self.kinds
         return part
 
@@ -315,29 +337,57 @@ def model_of(
     calibration: SensorCalibration | None,
     noise: Noise | None,
     procedure: Procedure,
-    accelerometer: SensorCalibration,
+    accelerometer: SensorCalibration | None,
     *,
     moved: Values | None = None,
+    known_by_limit: Mapping[str, float] | None = None,
 ) -> GyroscopeModel | None:
     """Return the model of the recordings' rests and moves, or None if there is no rest.
 
     ``calibration``: of the gyroscope; its outlying moves are not used. ``moved``: (12,), see ``moves.observed_rests``;
-    by default that of ``calibration``.
+    by default that of ``calibration``, as is ``known_by_limit``.
     """
     details = [stage.details for stage in calibration.stages] if calibration else []
     if moved is None:
         moved = next((np.array(d[MOVED]) for d in details if MOVED in d), None)
+    if known_by_limit is None:
+        known_by_limit = next((d[KNOWN_BY_LIMIT] for d in details if KNOWN_BY_LIMIT in d), {})
     observed = observed_rests(recordings, accelerometer, procedure, moved=moved)
     if observed is None:
         return None
     rests, gravity = observed
-    moves, turns, stated = moves_of(recordings, rests), None, procedure.turns
-    if stated is not None:
-        turns, every = turns_of(recordings, rests, accelerometer, stated)
-        require_turns(turns, every, stated)
+    moves = None if accelerometer is None else moves_of(recordings, rests)
+    turns = turns_of(recordings, rests, accelerometer, procedure)
     if moves is not None and calibration is not None:
         outlying = {(move["recording"], float(move["time_s"])) for d in details for move in d.get("moves_outlying", ())}
         names = [recordings[int(i)].name for i in rests.recording[moves.after]]
         keys = zip(names, moves.time[:, 0].tolist(), strict=True)
         moves = moves.select(np.array([key not in outlying for key in keys]))
-    return GyroscopeModel(rests, moves, gravity, noise, turns=turns)
+    sheet = procedure.sheet is not None
+    return GyroscopeModel(
+        rests,
+        moves,
+        gravity,
+        noise,
+        fewest=1 if sheet else MIN_MOVES,
+        turns=turns,
+        known_by_limit=known_by_limit,
+        between=_between_recordings(rests, turns, noise) if sheet else 0.0,
+    )
+
+
+def _between_recordings(rests: Rests, turns: TurnsByHand | None, noise: Noise | None) -> float:
+    """Return the standard deviation of the bias from one recording to the next, over white noise.
+
+    By the scatter of the means of the rests of each recording; with rests in one recording only, and turns in others,
+    it is the bias wander.
+    """
+    white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
+    names = np.unique(rests.recording)
+    if len(names) > 1:
+        own = [rests.recording == name for name in names]
+        means = np.array([np.average(rests.reading[k], axis=0, weights=rests.count[k]) for k in own]) / white
+        within = np.mean([np.average(rests.share[k], weights=rests.count[k]) / np.count_nonzero(k) for k in own])
+        return float(np.sqrt(max(np.mean(np.var(means, axis=0, ddof=1)) - within, 0.0)))
+    elsewhere = turns is not None and np.any(turns.recording != names[0])
+    return float(np.sqrt(np.mean((noise.wander / white) ** 2))) if elsewhere and noise is not None else 0.0

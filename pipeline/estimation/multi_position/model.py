@@ -28,6 +28,11 @@ the residuals show (Bartlett 1938):
 where h is the mean leverage of the model with the effect, over the kinds of equations in which the effect shows.
 delta BIC is the gain minus ``v log n``; p follows from chi squared with v degrees of freedom.
 
+A parameter that the recordings do not determine has a separate equation, a pseudo-observation of the value of an ideal
+sensor with the standard uncertainty u by the sensor file's limit (``limit_block``). ``between`` is the standard
+deviation of the bias from one recording to the next, over white noise: it adds ``between^2 H J H^T`` to S, where J is 1
+for two stretches of one recording and else 0.
+
 The models of both sensors have: ``kinds`` of scatter (1: rests; 2: rests and moves), ``rests_equations`` (their number;
 they come first), ``white`` noise of a raw sample, and ``directions``, (12, b): change of bias and matrix by each base
 parameter.
@@ -45,10 +50,10 @@ import scipy
 from pipeline.estimation import design
 from pipeline.estimation.gauss_markov import NO_INSTABILITY_ODDS, Setting, WanderPrior, block_covariance, selection_grid
 from pipeline.estimation.least_squares import cholesky
-from pipeline.records import BIAS, Index, Mask, Motion, Noise, Values, matrix_of
+from pipeline.records import BIAS, Index, Mask, Motion, Noise, Values, base_values, matrix_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
@@ -56,6 +61,8 @@ if TYPE_CHECKING:
 
 Model: TypeAlias = "AccelerometerModel | GyroscopeModel"
 
+# parameters that are 1 in an ideal sensor
+ONE = {f"{prefix}{axis}" for axis in "xyz" for prefix in ("scale_factor_", f"matrix_{axis}")}
 # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 MIN_NEW_NORM_SHARE = 1e-3
 # The grids below were chosen by the study of 500 recordings (tests/study/test_hand_held_study.py); ``fit.refined``
@@ -191,10 +198,29 @@ class EquationBlock:
     force: Values | None = None  # (n, m, 3); change of moves by the specific force at each rest, per g
 
 
+def limit_block(known: Mapping[str, float], columns: Values, state: State, unit: float = 1.0) -> EquationBlock:
+    """Return the pseudo-observations of parameters that the sensor file's limits alone determine.
+
+    ``known``: name to standard uncertainty; ``columns``: (k, 12), derivative of each by bias and matrix; ``unit``:
+    factor of the errors that are reported.
+    """
+    u = np.array(list(known.values()))
+    ideal = np.array([float(name in ONE) for name in known])
+    return EquationBlock(
+        (ideal - columns @ base_values(state.bias, state.matrix)) / u,
+        columns / u[:, None],
+        lambda term: np.zeros((len(u), len(term.values))),
+        unit * u,
+    )
+
+
 def stacked(
     blocks: Sequence[EquationBlock], model: Model, state: State, candidates: Sequence[EffectColumns]
 ) -> Equations:
-    """Stack blocks of equations; the block of the rests is the first."""
+    """Stack blocks of equations; the block of the rests is the first.
+
+    Blocks beyond the kinds of scatter, as the parts of soaks, share the last kind.
+    """
     sizes = [len(block.residual) for block in blocks]
     edges = np.cumsum([0, *sizes])
     start, length, recording = (
@@ -204,7 +230,7 @@ def stacked(
     bias, column = np.zeros((3, edges[-1], len(start))), 0
     for kind, (block, rows) in enumerate(zip(blocks, map(slice, edges[:-1], edges[1:]), strict=True)):
         if block.scattered:
-            scatter[kind, rows] = np.square(np.median(block.error) / block.error)
+            scatter[min(kind, model.kinds - 1), rows] = np.square(np.median(block.error) / block.error)
         if block.bias is not None:
             first = 0 if block.stretches is None else column
             bias[:, rows, first : first + block.bias.shape[2]] = block.bias
@@ -216,7 +242,10 @@ def stacked(
         filled = (np.zeros((n, n)) if part is None else part for part, n in zip(parts, sizes, strict=True))
         return np.asarray(scipy.linalg.block_diag(*filled))
 
-    same = recording[:, None] == recording
+    same, common = recording[:, None] == recording, diagonal([block.common for block in blocks])
+    if model.between:
+        added = model.between**2 * np.sum(bias @ same.astype(float) @ bias.transpose(0, 2, 1), axis=0)
+        common = added if common is None else common + added
     return Equations(
         residual=np.concatenate([block.residual for block in blocks]),
         base=np.concatenate([block.base for block in blocks]) @ model.directions,
@@ -228,7 +257,7 @@ def stacked(
         length=length,
         joined=np.ones_like(same) if model.rests.clock_shared else same,
         error=np.concatenate([block.error for block in blocks]),
-        common=diagonal([block.common for block in blocks]),
+        common=common,
         direction=diagonal([block.direction for block in blocks]),
     )
 

@@ -230,14 +230,14 @@ def clocks_of(time: Values, rate: Values, moves: Sequence[slice], white: Values)
     return [time[span] if line is None or gain <= CLEAR_CLOCK_GAIN else line for span, line in pairs]
 
 
-def sound_span(recording: Recording, span: slice) -> bool:
-    """Return whether the gyroscope's samples can be integrated: all valid, without a gap, for less than a minute."""
+def sound_span(recording: Recording, span: slice, longest: float = MAX_MOVE_S) -> bool:
+    """Return whether the gyroscope's samples can be integrated: all valid, without a gap, for less than ``longest``."""
     time = recording.time[span]
     whole = bool(np.all(sound_samples(recording, "gyroscope")[span]))
     return (
         whole
         and len(time) > 2
-        and time[-1] - time[0] < MAX_MOVE_S
+        and time[-1] - time[0] < longest
         and np.diff(time).max() < MAX_INTERPOLATED_INTERVALS * recording.interval
     )
 
@@ -283,17 +283,21 @@ class GravityAtRests:
 
 def observed_rests(
     recordings: Sequence[Recording],
-    accelerometer: SensorCalibration,
+    accelerometer: SensorCalibration | None,
     procedure: Procedure,
     role: str = ROLE,
     moved: Values | None = None,
 ) -> tuple[Rests, GravityAtRests] | None:
     """Return the gyroscope's rests and gravity at them, or None where the recordings of a role hold none.
 
+    Without an accelerometer gravity is unknown, and zero.
+
     ``moved`` is added to bias and matrix of the accelerometer, (12,): gravity is linear in their errors from there on.
     """
     of_force = rests_of("accelerometer", recordings, procedure, accelerometer, role)
     of_rate = rests_of("gyroscope", recordings, procedure, accelerometer, role)
+    if accelerometer is None:
+        return None if of_rate is None else (of_rate, _no_gravity(len(of_rate.time)))
     if of_force is None or of_rate is None:
         return None
     keys = [list(zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)) for r in (of_force, of_rate)]
@@ -304,6 +308,13 @@ def observed_rests(
     if len(of_rate.time) == 0:
         return None
     return of_rate, gravity_of(recordings, of_force, accelerometer, moved)
+
+
+def _no_gravity(count: int) -> GravityAtRests:
+    zeros, none = np.zeros((count, 3)), np.zeros(count)
+    errors = np.zeros((BASE_COUNT, BASE_COUNT))
+    shared = np.zeros((count, 3, BASE_COUNT))
+    return GravityAtRests(zeros, zeros, zeros, none, none, errors, shared, np.zeros(count, bool), np.zeros(BASE_COUNT))
 
 
 def gravity_of(
@@ -335,7 +346,8 @@ def gravity_of(
         noise = np.where(creeps, np.maximum(noise, share), noise)
         creeping |= np.linalg.norm(near - u, axis=1) > SIGNIFICANT_OFFSET_DEVIATIONS * np.sqrt(share * white)
     between = [float(stage.details.get("scatter_between_rests") or 0.0) for stage in accelerometer.stages]
-    spread = np.sqrt(noise * white + np.mean(rests.step**2, axis=1) / 12.0 + max(between, default=0.0) ** 2)
+    of_steps = rests.own + np.mean(rests.step**2, axis=1) / 12.0
+    spread = np.sqrt(noise * white + of_steps + max(between, default=0.0) ** 2)
     unsure = np.linalg.norm(force, axis=1) * np.radians(rests.creep_error) * 0.5 * rests.length
     v = rests.reading - accelerometer.bias
     shared = -accelerometer.matrix @ root[BIAS] + np.einsum("mj,ijp->mip", v, root[MATRIX].reshape(3, 3, -1))

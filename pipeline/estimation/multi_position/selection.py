@@ -102,7 +102,8 @@ class SelectionByHand:
         self.hypotheses = selection_hypotheses(noise, model.kinds)
         self.limits = limits_of(model.sensor, data_sheet)
         effects = catalogue().items()
-        self.candidates = [e for n, e in effects if n not in configured and not refusal(e, model.sensor, model.rests)]
+        others = [e for n, e in effects if n not in configured and (not e.shown_by or e.shown_by in model.rests.kinds)]
+        self.candidates = [e for e in others if not refusal(e, model.sensor, model.rests)]
         self.bounds = {n: MAX_TIMES_LIMIT * limit for n, limit in self.limits.items() if effect(n).nonlinear}
         self.base = fit_configured(model, start, configured, self.hypotheses, self.bounds)
         self.names: list[str] = []

@@ -82,6 +82,7 @@ class Effect(abc.ABC):
     nonlinear: tuple[str, ...] = ()  # parameters in which the reading is not linear
     prior: str = ""  # setting of the table that adds it to the model: standard deviation of its parameters
     contains: tuple[str, ...] = ()  # effects of which this is a generalisation; the two are never fitted together
+    shown_by: str = ""  # kind of a sheet's recording, without which it is no candidate
     unseen: Mapping[str, str] = MappingProxyType({})  # sensor to the reason why the effect never changes its readings
     meaning: str  # one sentence for the reader of a report
     excitation: str  # advice: the motion or temperature that makes this effect observable

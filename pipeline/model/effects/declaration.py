@@ -82,6 +82,7 @@ class Declaration:
     source: str = ""
     typical_share: float = 0.5
     proposed: bool = False
+    shown_by: str = ""
     built_in: bool = False
     python: str = ""
     parameters: dict[str, Term] = field(default_factory=dict)
@@ -215,6 +216,7 @@ BUILT_IN_CHECKS: dict[str, Check] = {
     "built_in": flag,
     "proposed": flag,
     "prior": TEXT,
+    "shown_by": TEXT,
     "python": TEXT,
     "parameters": each(lambda given: Term(**fields(TERM_CHECKS, ("unit",))(given))),
 }

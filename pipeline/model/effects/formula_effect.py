@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 AS_DECLARED = (
     *("name", "owner", "sensors", "contains", "prior", "needs_both_directions", "meaning", "excitation", "experiment"),
-    *("experiment_by_hand", "source", "typical_share", "proposed"),
+    *("experiment_by_hand", "source", "typical_share", "proposed", "shown_by"),
 )
 OF_THE_TURN = ("angle", "rate")
 NEEDED = ("temperature", "angle", "rate", "level")  # fields that a motion may lack

@@ -1,0 +1,194 @@
+"""Whether U covers the truth for recordings that a sheet lists, kind by kind; by a simulation of its own.
+
+    python tests/study/listed_recordings.py --kind turns --units 30 --seed 1
+
+The simulation uses no code of the package. It writes ``recordings.csv`` and its files, and ``pipeline.calibrate`` reads
+them. A parameter is inside where the published value is within the published U of the truth. Parameters that the
+recordings determine and those held by the sensor file are counted apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+
+import pipeline
+
+RATE_HZ = 100.0
+# As the sensor file mpu6050: white noise of a sample, bias wander, its time; limits of bias, scale factor, cross-axis.
+WHITE = {"accelerometer": 4e-4 * np.sqrt(RATE_HZ / 2.0), "gyroscope": 5e-3 * np.sqrt(RATE_HZ / 2.0)}
+WANDER = {"accelerometer": 1e-4, "gyroscope": 3e-3}
+TAU_S = 100.0
+LIMITS = {"accelerometer": (0.08, 0.03, 0.02), "gyroscope": (20.0, 0.03, 0.02)}
+BETWEEN = 0.01  # deg/s, of the gyroscope's bias between files
+COLUMNS = "time_s,accel_x_g,accel_y_g,accel_z_g,gyro_x_dps,gyro_y_dps,gyro_z_dps"
+
+
+class Unit:
+    """A simulated unit: its truth, and the files that were recorded with it."""
+
+    def __init__(self, folder: Path, rng: np.random.Generator) -> None:
+        self.folder, self.rng, self.rows = folder, rng, ["file,kind,axis,angle_deg,angle_accuracy_deg,held_out"]
+        self.bias, self.K = {}, {}
+        for sensor, (bias, scale, cross) in LIMITS.items():
+            self.bias[sensor] = bias * rng.uniform(-1.0, 1.0, 3) * (0.2 if sensor == "gyroscope" else 1.0)
+            K = cross * rng.uniform(-1.0, 1.0, (3, 3))
+            np.fill_diagonal(K, 1.0 + scale * rng.uniform(-1.0, 1.0, 3))
+            self.K[sensor] = K
+        self.extra: Any = None  # what temperature adds, a function of sensor and temperature
+
+    def frame(self) -> np.ndarray:
+        """Rotation from the case to the frame of the accelerometer, in which its matrix is lower triangular."""
+        M = np.linalg.inv(self.K["accelerometer"])
+        Q = np.linalg.qr(M[:, ::-1])[0][:, ::-1]
+        return (Q * np.sign(np.diag(Q.T @ M))).T
+
+    def truth(self, sensor: str, *, in_case: bool) -> np.ndarray:
+        """Bias and matrix: (12,), in the frame of the accelerometer or that of the case."""
+        M = np.linalg.inv(self.K[sensor])
+        return np.concatenate([self.bias[sensor], (M if in_case else self.frame() @ M).ravel()])
+
+    def read(self, sensor: str, true: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Readings of the true motion (n, 3)."""
+        n, rng = len(true), self.rng
+        keep = np.exp(-1.0 / (RATE_HZ * TAU_S))
+        drive = rng.normal(size=(n, 3)) * np.sqrt(1.0 - keep**2)
+        start = keep * rng.normal(size=(1, 3))
+        wander = scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0, zi=start)[0]
+        noise = WHITE[sensor] * rng.normal(size=(n, 3)) + WANDER[sensor] * wander
+        return self.bias[sensor] + offset + true @ self.K[sensor].T + noise
+
+    def write(self, name: str, row: str, force: np.ndarray, rate: np.ndarray, sensors: str = "ag") -> None:
+        """Record a file."""
+        start = 0.0
+        time = start + np.arange(len(rate)) / RATE_HZ
+        readings = []
+        if "a" in sensors:
+            readings.append(self.read("accelerometer", force, np.zeros(3)))
+        if "g" in sensors:
+            readings.append(self.read("gyroscope", rate, BETWEEN * self.rng.normal(size=3)))
+        names = COLUMNS.split(",")
+        used = [0, *([1, 2, 3] if "a" in sensors else []), *([4, 5, 6] if "g" in sensors else [])]
+        header = ",".join(names[i] for i in used)
+        table = np.column_stack([time, *readings])
+        np.savetxt(self.folder / f"{name}.csv", table, fmt="%.9g", delimiter=",", header=header, comments="")
+        self.rows.append(f"{name}.csv,{row}")
+
+    def sheet(self) -> None:
+        """Write the sheet."""
+        (self.folder / "recordings.csv").write_text("\n".join(self.rows) + "\n")
+
+
+def rotation(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Rotations by angles (n,), rad, about a unit axis: (n, 3, 3)."""
+    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.eye(3) + s * k + (1 - c) * (k @ k)
+
+
+def at_rest(seconds: float, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Force and rate at rest."""
+    n = round(seconds * RATE_HZ)
+    return np.tile(up, (n, 1)), np.zeros((n, 3))
+
+
+def turned(angle_deg: float, peak: float, axis: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Force and rate of a smooth turn about an axis of the body: the force is ``up`` turned by -a."""
+    n = round(2.0 * abs(angle_deg) / peak * RATE_HZ)
+    phase = (np.arange(n) + 0.5) / n
+    rate = angle_deg / n * (1.0 - np.cos(2.0 * np.pi * phase)) * RATE_HZ
+    angle = angle_deg * (phase - np.sin(2.0 * np.pi * phase) / (2.0 * np.pi))
+    force = rotation(axis, -np.radians(angle)) @ up
+    return force, rate[:, None] * axis
+
+
+def joined(*parts: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Parts of a recording, one after the other."""
+    return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+
+def sphere(rng: np.random.Generator) -> np.ndarray:
+    """A direction at random."""
+    v = rng.normal(size=3)
+    return v / np.linalg.norm(v)
+
+
+def turns(unit: Unit, sensors: str) -> None:
+    """Turns by hand about x, y and z, in one or two files an axis, some with rests; rests in one to four attitudes."""
+    rng = unit.rng
+    accuracy = float(np.exp(rng.uniform(np.log(0.1), np.log(5.0))))
+    for k in range(int(rng.integers(1, 5))):
+        unit.write(f"rest_{k}", "rest,,,,", *at_rest(rng.uniform(3.0, 20.0), sphere(rng)), sensors)
+    for i, axis in enumerate("xyz"):
+        off = np.radians(1.5) * rng.normal(size=3) * (np.arange(3) != i)
+        e = np.eye(3)[i] + off
+        e /= np.linalg.norm(e)
+        for k in range(int(rng.integers(1, 3))):
+            stated = float(rng.choice([360.0, -360.0, 720.0, 361.338]))
+            up, angle = sphere(rng), stated + accuracy * rng.normal()
+            turn = turned(angle, rng.uniform(40.0, 150.0), e, up)
+            parts = [turn]
+            if rng.uniform() < 0.7:
+                end = rotation(e, np.array([-np.radians(angle)]))[0] @ up
+                parts = [at_rest(rng.uniform(2.0, 8.0), up), turn, at_rest(rng.uniform(2.0, 8.0), end)]
+            shown = "" if stated in (360.0, -360.0, 720.0) and rng.uniform() < 0.3 else f"{stated:g}"
+            unit.write(f"turn_{axis}_{k}", f"turn,{axis},{shown},{accuracy:.3g},", *joined(*parts), sensors)
+
+
+KINDS = {"turns": lambda unit: turns(unit, "ag"), "turns_gyroscope": lambda unit: turns(unit, "g")}
+
+
+def run(kind: str, seed: int, number: int) -> dict[str, list[tuple[str, float, bool]]]:
+    """Calibrate a unit; returns for each sensor parameter, error over U, and whether recordings determine it."""
+    with tempfile.TemporaryDirectory() as name:
+        unit = Unit(Path(name), np.random.default_rng([seed, number]))
+        KINDS[kind](unit)
+        unit.sheet()
+        overrides = ["diagnosis.depth=standard"]
+        found = pipeline.calibrate(unit.folder, sensor="mpu6050", procedure="listed", overrides=overrides).calibration
+    out: dict[str, list[tuple[str, float, bool]]] = {}
+    names = [f"bias_{a}" for a in "xyz"] + [f"matrix_{i}{j}" for i in "xyz" for j in "xyz"]
+    for sensor in LIMITS:
+        part = found[sensor]
+        if part is None:
+            continue
+        value = np.concatenate([part["bias"], np.ravel(part["matrix"])])
+        U = np.concatenate([part["expanded_uncertainty"]["bias"], np.ravel(part["expanded_uncertainty"]["matrix"])])
+        by = np.concatenate([part["determined_by"]["bias"], np.ravel(part["determined_by"]["matrix"])])
+        error = value - unit.truth(sensor, in_case=found["accelerometer"] is None)
+        out[sensor] = [
+            (n, float(e / u), d == "recordings") for n, e, u, d in zip(names, error, U, by, strict=True) if u > 0.0
+        ]
+    return out
+
+
+def main(argv: list[str]) -> int:
+    """Print the coverage of each sensor and group of parameters."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kind", choices=KINDS, required=True)
+    parser.add_argument("--units", type=int, default=30)
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args(argv)
+    counts: dict[tuple[str, str, str], list[float]] = {}
+    for number in range(arguments.units):
+        for sensor, rows in run(arguments.kind, arguments.seed, number).items():
+            for name, ratio, recorded in rows:
+                group = "bias" if name.startswith("bias") else "scale" if name[-1] == name[-2] else "cross"
+                counts.setdefault((sensor, group, "recordings" if recorded else "sensor_file"), []).append(ratio)
+    for (sensor, group, by), ratios in sorted(counts.items()):
+        inside = np.abs(ratios) <= 1.0
+        sys.stdout.write(
+            f"{sensor:13} {group:6} {by:12} {inside.sum():4d} of {len(ratios):4d} = {inside.mean():.3f}, "
+            f"rms error/U {np.sqrt(np.mean(np.square(ratios))):.2f}\n"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
