@@ -80,7 +80,8 @@ def findings(case: DiagnosisInput) -> Findings:
     chi = [
         float(np.sum(project_out(model.equations(fit.state), [with_scatter]).residual ** 2)) for fit in selection.fits
     ]
-    over, left_over = (_over_noise(model, selection.fits[k], expected) for k in (0, -1))
+    moving = with_scatter if "slow" in model.rests.kinds else expected  # its accelerations are no missing effect
+    over, left_over = (_over_noise(model, selection.fits[k], moving) for k in (0, -1))
     verdict = verdict_of_selection_by_hand(selection.names, unknown, left_over)
     scores = project_out(model.equations(selection.fits[-1].state), selection.hypotheses).scores()
     best = selection.hypotheses[int(np.argmax(scores))]

@@ -261,7 +261,7 @@ def rests_of(
     chosen: dict[int, list[Rest]] = {}
     held: set[tuple[int, int]] = set()
     for index, recording in enumerate(recordings):
-        if recording.role == role and recording.reading(sensor) is not None:
+        if recording.role == role and recording.reading(sensor) is not None and _rests(recording, sensor):
             split = split_rests(recording, every)
             rests = sorted([*split.used, *split.held_out], key=lambda rest: rest.start)
             chosen[index] = [r for r in rests if (recording.name, float(recording.time[r.start])) not in refused]
@@ -351,6 +351,11 @@ def _rests_on_table(recording: Recording, table: Table) -> list[Rest] | None:
     if stop_and_go(motion):
         return rests_from_table(recording)
     return [Rest(i, i + 1) for i in np.flatnonzero(sound_samples(recording, "accelerometer")).tolist()]
+
+
+def _rests(recording: Recording, sensor: str) -> bool:
+    """Return whether a sensor rests: in slow movement, which shows the length of gravity, the gyroscope does not."""
+    return sensor == "accelerometer" or recording.kind != "slow"
 
 
 @once

@@ -55,6 +55,7 @@ REST_EDGE_S, FEWEST_TO_SETTLE = 0.5, 6  # edge of a rest that may move, at most 
 SETTLED_DIFFERENCE_DEVIATIONS = 8.0  # of the noise between successive samples: white noise passes in 1e-14
 
 RATE_AT_REST = "rate_at_rest_dps"  # in the source of a turn: what the gyroscope reads in the recordings at rest
+SLOW_PARTS, SLOW_PART_S = 120, 0.2  # parts of slow movement: a turn at 30 deg/s shortens their mean by 0.5 mg
 SOAK_PARTS = 40  # of a soak: over a span of 80 degC, 2 degC each
 
 
@@ -116,11 +117,16 @@ def find_rests(recording: Recording) -> list[Rest]:
 
     A rest in which the sensor moved is marked as refused, with the reason. If a sheet states the kind of the recording,
     ``rest`` is one rest, the longest or, if none is found, the whole; ``soak`` parts of equal length, in which the
-    temperature hardly changes; ``attitudes`` the blocks of its rows.
+    temperature hardly changes; ``slow`` short parts, for the length of gravity alone; ``attitudes`` the blocks of rows.
     """
     if recording.kind == "soak":
         edges = np.linspace(0, recording.samples, min(SOAK_PARTS, recording.samples) + 1).astype(int)
         return [Rest(a, b) for a, b in pairwise(edges.tolist())]
+    if recording.kind == "slow":
+        size = max(5, round(SLOW_PART_S / _interval(recording))) if recording.samples > 1 else 1
+        starts = np.unique(np.linspace(0, max(recording.samples - size, 0), SLOW_PARTS).astype(int))
+        apart = starts[np.concatenate([[True], np.diff(starts) >= size])]
+        return [Rest(a, min(a + size, recording.samples)) for a in apart.tolist()]
     if recording.kind == "attitudes":
         starts = np.flatnonzero(np.diff(recording.time_ns) > 0.5 * BETWEEN_ATTITUDES_S * 1e9) + 1
         return [Rest(a, b) for a, b in pairwise([0, *starts.tolist(), recording.samples])]

@@ -135,7 +135,9 @@ class HeldOutCase:
 
     def at_rests(self, rests: Mapping[str, Sequence[Rest]]) -> list[Samples]:
         """Return the mean readings of given rests, by the name of their recording."""
-        found = (self._means(r, rests[r.name]) for r in self.recordings if rests.get(r.name))
+        gyroscope = self.calibration.sensor == "gyroscope"
+        chosen = (r for r in self.recordings if rests.get(r.name) and not (gyroscope and r.kind == "slow"))
+        found = (self._means(r, rests[r.name]) for r in chosen)
         return [samples for samples in found if samples is not None]
 
     def _at_rests_of(self, role: str) -> list[Samples]:
@@ -169,6 +171,9 @@ class HeldOutCase:
         share, own = variances_of_means(recording, counts, sensor)
         averaged = variance_of_average(counts.astype(np.float64) * recording.interval, noise.correlation_time)
         white = share[:, None] * noise.white**2 + own[:, None]
+        if recording.kind == "slow":  # by the accelerations of the movement, as far as they scatter in the fit
+            details = [stage.details for stage in self.calibration.stages]
+            white = white + max((float(d.get("scatter_between_rests") or 0.0) for d in details), default=0.0) ** 2
         if sensor == "gyroscope" and recording.accelerometer is not None:
             rate, unknown = _creep(recording, rests, other)
             reading, white = reading - rate, white + unknown

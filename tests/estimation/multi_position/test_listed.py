@@ -1,0 +1,140 @@
+"""Recordings that a sheet lists, against the truth of a simulation that shares no code with the package."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+import pipeline
+from pipeline.errors import InputError
+from tests.study.listed_recordings import Unit, at_rest, joined, turned
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SENSOR = "mpu6050"
+
+
+def calibrated(folder: Path, *overrides: str) -> Any:
+    return pipeline.calibrate(folder, sensor=SENSOR, procedure="listed", overrides=list(overrides))
+
+
+def errors(unit: Unit, document: dict[str, Any], sensor: str, *, in_case: bool = False) -> np.ndarray:
+    """Error over U of bias and matrix: (12,); 0 where U is 0."""
+    part = document[sensor]
+    value = np.concatenate([part["bias"], np.ravel(part["matrix"])]) - unit.truth(sensor, in_case=in_case)
+    U = np.concatenate([part["expanded_uncertainty"]["bias"], np.ravel(part["expanded_uncertainty"]["matrix"])])
+    return np.where(U > 0.0, value / np.where(U > 0.0, U, 1.0), 0.0)
+
+
+def with_three_turns(folder: Path, angle: float = 360.0) -> Unit:
+    """A rest, and a turn about each axis by a stop, without an accelerometer."""
+    unit, up = Unit(folder, np.random.default_rng(4)), np.array([0.0, 0.0, 1.0])
+    unit.write("still", "rest,,,,", *at_rest(20.0, up), "g")
+    for axis, e in zip("xyz", np.eye(3), strict=True):
+        turn = joined(at_rest(4.0, up), turned(angle, 90.0, e, up), at_rest(4.0, up))
+        unit.write(f"turn_{axis}", f"turn,{axis},{angle:g},0.05,", *turn, "g")
+    unit.sheet()
+    return unit
+
+
+def test_three_turns_and_a_rest_calibrate_a_gyroscope(tmp_path: Path) -> None:
+    unit = with_three_turns(tmp_path)
+    found = calibrated(tmp_path, "procedure.turns.axis_accuracy_deg=0.1").calibration
+    assert found["accelerometer"] is None
+    part = found["gyroscope"]
+    assert np.abs(errors(unit, found, "gyroscope", in_case=True)).max() < 1.5
+    assert set(np.ravel(part["determined_by"]["matrix"])) == {"recordings"}
+    scale = np.diag(part["expanded_uncertainty"]["matrix"])
+    assert np.all(scale < 4.0 * 0.05 / 360.0 + 2.0 * 0.1 / 360.0 * 16.0)  # the stop, and the bias over eight seconds
+
+
+def test_an_axis_that_is_known_to_a_degree_leaves_the_cross_axis_terms_to_the_sensor_file(tmp_path: Path) -> None:
+    with_three_turns(tmp_path)
+    result = calibrated(tmp_path)
+    by = np.array(result.calibration["gyroscope"]["determined_by"]["matrix"])
+    assert set(np.diag(by)) == {"recordings"}
+    assert set(by[~np.eye(3, dtype=bool)]) == {"sensor_file"}
+    assert result.verdict["gyroscope"] == "not_enough_data"
+    U = np.array(result.calibration["gyroscope"]["expanded_uncertainty"]["matrix"])
+    limit = 0.02 / np.sqrt(3.0)  # cross_axis of the sensor file
+    assert np.all(U[~np.eye(3, dtype=bool)] > 1.5 * limit)
+    assert np.all(U[~np.eye(3, dtype=bool)] < 2.5 * limit)
+
+
+def test_a_turn_in_the_other_sense_is_refused_with_the_angle_that_agrees(tmp_path: Path) -> None:
+    with_three_turns(tmp_path, angle=-360.0)
+    sheet = tmp_path / "recordings.csv"
+    sheet.write_text(sheet.read_text().replace("turn,y,-360", "turn,y,360"))
+    with pytest.raises(Exception, match=r"turn_y is no turn about y by 360 deg.*angle_deg -360 would agree"):
+        calibrated(tmp_path)
+
+
+def test_a_bad_sheet_is_the_error_of_its_unit(tmp_path: Path) -> None:
+    (tmp_path / "recordings.csv").write_text("file,kind\na.csv,resting\n")
+    with pytest.raises(InputError, match="column kind: 'resting'"):
+        calibrated(tmp_path)
+
+
+def test_24_means_calibrate_an_accelerometer_and_25_others_judge_it(tmp_path: Path) -> None:
+    unit = Unit(tmp_path, np.random.default_rng(5))
+    for name, count, held in (("fit", 24, ""), ("other", 25, "yes")):
+        up = unit.rng.normal(size=(count, 3))
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        mean = unit.bias["accelerometer"] + up @ unit.K["accelerometer"].T + 2e-4 * unit.rng.normal(size=(count, 3))
+        header = "accel_x_g,accel_y_g,accel_z_g"
+        np.savetxt(tmp_path / f"{name}.csv", mean, fmt="%.8g", delimiter=",", header=header, comments="")
+        unit.rows.append(f"{name}.csv,attitudes,,,,{held}")
+    unit.sheet()
+    result = calibrated(tmp_path)
+    assert np.abs(errors(unit, result.calibration, "accelerometer")).max() < 1.2
+    judged = result.validation["accelerometer"]
+    assert judged["held_out"]
+    assert judged["samples"] == 25
+    assert judged["steps"][-1]["rms_error"] < 4e-4
+    assert set(np.ravel(result.calibration["accelerometer"]["determined_by"]["matrix"])) == {"recordings"}
+
+
+def test_blocks_of_rows_with_a_label_are_attitudes(tmp_path: Path) -> None:
+    unit = Unit(tmp_path, np.random.default_rng(6))
+    lines = ["label,accel_x_g,accel_y_g,accel_z_g"]
+    for k in range(12):
+        up = unit.rng.normal(size=3)
+        mean = unit.bias["accelerometer"] + unit.K["accelerometer"] @ up / np.linalg.norm(up)
+        rows = mean + 1e-3 * unit.rng.normal(size=(20, 3))
+        lines += [f"attitude {k}," + ",".join(f"{v:.7f}" for v in row) for row in rows]
+    (tmp_path / "samples.csv").write_text("\n".join(lines) + "\n")
+    unit.rows.append("samples.csv,attitudes,,,,")
+    unit.sheet()
+    found = calibrated(tmp_path).calibration
+    assert found["accelerometer"]["stages"][0]["details"]["orientations_used"] == 12
+    assert np.abs(errors(unit, found, "accelerometer")).max() < 1.2
+
+
+def test_a_soak_shows_bias_over_temperature_to_the_third_power(tmp_path: Path) -> None:
+    rng, rate, n = np.random.default_rng(7), 2.0, 5400
+    time = np.arange(n) / rate
+    for name, phase in (("soak", 0.0), ("other", 1.0)):
+        warm = 40.0 * np.sin(2.0 * np.pi * time / 2700.0 + phase)
+        gyro = np.outer(warm, [0.01, -0.02, 0.03]) + np.outer(warm**3, [2e-6, -3e-6, 1e-6]) + [0.5, -1.0, 2.0]
+        force = np.outer(warm, [1e-4, -2e-4, 3e-4]) + np.array([0.01, -0.02, 1.03])
+        noise = rng.normal(size=(n, 6)) * np.repeat([4e-4, 5e-3], 3) * np.sqrt(rate / 2.0)
+        table = np.column_stack([time, np.column_stack([force, gyro]) + noise, 25.0 + warm])
+        header = "time_s,accel_x_g,accel_y_g,accel_z_g,gyro_x_dps,gyro_y_dps,gyro_z_dps,temperature_degc"
+        np.savetxt(tmp_path / f"{name}.csv", table, fmt="%.8g", delimiter=",", header=header, comments="")
+    (tmp_path / "recordings.csv").write_text("file,kind,held_out\nsoak.csv,soak,\nother.csv,soak,yes\n")
+    result = calibrated(tmp_path, "effects.accelerometer=auto", "effects.gyroscope=auto")
+    effects = {s: result.calibration[s]["effects"][0] for s in ("accelerometer", "gyroscope")}
+    assert effects["gyroscope"]["name"] == "bias_temperature_cubic"
+    assert effects["accelerometer"]["name"] == "bias_temperature"
+    for axis, cubic, linear in (("x", 2e-6, 1e-4), ("y", -3e-6, -2e-4), ("z", 1e-6, 3e-4)):
+        b3 = effects["gyroscope"]["parameters"][f"b_T3_{axis}"]
+        b1 = effects["accelerometer"]["parameters"][f"b_T_{axis}"]
+        assert abs(b3["value"] - cubic) < 1.5 * b3["expanded_uncertainty"] < 0.1 * abs(cubic)
+        assert abs(b1["value"] - linear) < 1.5 * b1["expanded_uncertainty"] < 0.05 * abs(linear)
+    steps = result.validation["gyroscope"]["steps"]
+    assert steps[-1]["rms_error"] < 0.01
+    assert steps[0]["rms_error"] > 1.0
+    assert result.calibration["calibrated_range"]["temperature_degc"] == pytest.approx([-15.0, 65.0], abs=0.5)
