@@ -21,7 +21,8 @@ from pipeline.estimation.multi_position.effects import accelerometer_of
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly, with_limits
 from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, MOVED, model_of
-from pipeline.estimation.multi_position.model import MIN_NEW_NORM_SHARE, ONE, State, prior_hypotheses
+from pipeline.estimation.multi_position.limits import ONE
+from pipeline.estimation.multi_position.model import MIN_NEW_NORM_SHARE, State, prior_hypotheses
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise import wander_prior

@@ -28,12 +28,12 @@ import numpy as np
 import scipy
 
 from pipeline.estimation.multi_position.faces_and_turns import Faces, faces_of
+from pipeline.estimation.multi_position.limits import limit_block
 from pipeline.estimation.multi_position.model import (
     EquationBlock,
     Equations,
     State,
     effect_readings,
-    limit_block,
     motion_of,
     stacked,
 )

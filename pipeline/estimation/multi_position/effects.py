@@ -13,6 +13,7 @@ from pipeline.estimation.multi_position.model import selection_hypotheses
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import SelectionByHand, fit_configured, refusal
 from pipeline.estimation.noise import with_noises
+from pipeline.estimation.rest_means import ROLE
 from pipeline.estimation.stages import given_calibration, is_given
 from pipeline.model.effects import effect
 

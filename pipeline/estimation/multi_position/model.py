@@ -29,7 +29,7 @@ where h is the mean leverage of the model with the effect, over the kinds of equ
 delta BIC is the gain minus ``v log n``; p follows from chi squared with v degrees of freedom.
 
 A parameter that the recordings do not determine has a separate equation, a pseudo-observation of the value of an ideal
-sensor with the standard uncertainty u by the sensor file's limit (``limit_block``). ``between`` is the standard
+sensor with the standard uncertainty u by the sensor file's limit (``limits``). ``between`` is the standard
 deviation of the bias from one recording to the next, over white noise: it adds ``between^2 H J H^T`` to S, where J is 1
 for two stretches of one recording and else 0.
 
@@ -50,10 +50,10 @@ import scipy
 from pipeline.estimation import design
 from pipeline.estimation.gauss_markov import NO_INSTABILITY_ODDS, Setting, WanderPrior, block_covariance, selection_grid
 from pipeline.estimation.least_squares import cholesky
-from pipeline.records import BIAS, Index, Mask, Motion, Noise, Values, base_values, matrix_of
+from pipeline.records import BIAS, Index, Mask, Motion, Noise, Values, matrix_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
@@ -61,8 +61,6 @@ if TYPE_CHECKING:
 
 Model: TypeAlias = "AccelerometerModel | GyroscopeModel"
 
-# parameters that are 1 in an ideal sensor
-ONE = {f"{prefix}{axis}" for axis in "xyz" for prefix in ("scale_factor_", f"matrix_{axis}")}
 # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 MIN_NEW_NORM_SHARE = 1e-3
 # The grids below were chosen by the study of 500 recordings (tests/study/test_hand_held_study.py); ``fit.refined``
@@ -196,22 +194,6 @@ class EquationBlock:
     direction: Values | None = None
     shared: Values | None = None  # (n, 12); change of moves by errors of the accelerometer's calibration
     force: Values | None = None  # (n, m, 3); change of moves by the specific force at each rest, per g
-
-
-def limit_block(known: Mapping[str, float], columns: Values, state: State, unit: float = 1.0) -> EquationBlock:
-    """Return the pseudo-observations of parameters that the sensor file's limits alone determine.
-
-    ``known``: name to standard uncertainty; ``columns``: (k, 12), derivative of each by bias and matrix; ``unit``:
-    factor of the errors that are reported.
-    """
-    u = np.array(list(known.values()))
-    ideal = np.array([float(name in ONE) for name in known])
-    return EquationBlock(
-        (ideal - columns @ base_values(state.bias, state.matrix)) / u,
-        columns / u[:, None],
-        lambda term: np.zeros((len(u), len(term.values))),
-        unit * u,
-    )
 
 
 def stacked(
