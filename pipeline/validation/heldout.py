@@ -296,6 +296,8 @@ def _why_not_held_out(case: HeldOutCase) -> str:
     """Return why no samples are held out."""
     reason = f"no held-out recording holds readings of the {case.calibration.sensor} and a reference for them"
     procedure = case.settings.procedure
+    if procedure.sheet is not None:
+        return reason + f" (column held_out of {procedure.sheet})"
     if case.by_hand and procedure.turns is not None:
         return reason + " (with two turns about each axis between rests of 4 s or longer, the second is held out)"
     count, fewest = count_of_rests(case.recordings), procedure.holdout_from
