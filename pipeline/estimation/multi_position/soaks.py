@@ -35,7 +35,7 @@ class Soaks:
     def equations(self, state: State, force: Values, white: Values) -> EquationBlock:
         """Return the equations; ``force``: (s, 3), g, of the references; ``white``: (3,), noise of a sample."""
         rests, first = self.rests, self.reference
-        variance, of_first = (r.share[:, None] * white**2 + r.own[:, None] for r in (rests, first))
+        variance, of_first = (r.variance(white) for r in (rests, first))
         error = np.sqrt(variance + of_first[self.of])
         at = motion_of(rests.time, force[self.of], np.zeros_like(rests.reading), rests.temperature, still=True)
         there = motion_of(first.time, force, np.zeros_like(force), first.temperature, still=True)
