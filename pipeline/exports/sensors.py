@@ -5,15 +5,16 @@ truth = matrix @ (reading - bias - effects),    reading = bias + K @ truth + eff
 White noise n and random walk k, for estimators with only these two terms, follow from the terms identified at rest:
 
     n^2 = N^2 + sum 2 G^2 T  (T < ``MIN_EXPORTED_TIME_S``)
-    k^2 = K^2 + sum 2 G^2 / T  (other processes) + 3 (2 ln 2 / pi)^2 B^4 / n^2
+    k^2 = K^2 + sum 3 sigma^2(t) / t  (other processes) + 3 (2 ln 2 / pi)^2 B^4 / n^2
 
-A fast Gauss-Markov process is white over the averaging times of estimators; a slow one begins like the random walk with
-the same increments. The walk for a bias instability B has the Allan variance of B at the averaging time at which the
-white noise has it. n is continuous: the standard deviation of a sample is n sqrt(rate). For an axis without a slow
-term, the walk is the lesser of its upper limit and the walk for the bias wander in the configuration, s sqrt(2 / T).
-The value of a sensor is the root mean square of its axes. If no term was identified, both follow from the
-configuration, with ``n = noise_density / sqrt(2)``, because its density is one-sided. Quantisation, ramps and sinusoids
-are not included.
+A fast Gauss-Markov process is white over the averaging times of estimators. Of another process the walk has the Allan
+variance sigma^2 at the longest time measured, t = L / 9 for a rest of length L (9 averages determine it to 25 %, IEEE
+Std 952): the process is bounded, so that the walk with its first increments, 2 G^2 / T, grows beyond it. The walk for a
+bias instability B has the Allan variance of B at the averaging time at which the white noise has it. n is continuous:
+the standard deviation of a sample is n sqrt(rate). For an axis without a slow term, the walk is the lesser of its upper
+limit and the walk for the bias wander in the configuration, s sqrt(2 / T). The value of a sensor is the root mean
+square of its axes. If no term was identified, both follow from the configuration, with ``n = noise_density / sqrt(2)``,
+because its density is one-sided. Quantisation, ramps and sinusoids are not included.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
+from pipeline.estimation.noise_terms import allan_variance
 from pipeline.io.axis_maps import STRAIGHT, maps_of_log
 from pipeline.model.calibration_file import MIN_EXPORTED_TIME_S, sentences
 from pipeline.model.effects import owner_of
@@ -41,6 +43,7 @@ JSON = dict[str, Any]
 FACTORS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "deg/s": 1.0, "rad/s": float(np.pi / 180.0)}
 SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 AVERAGING_S = 1.0  # averaging time of the effective density in remarks
+FEWEST_AVERAGES = 9  # of a rest at the longest averaging time: 1 / sqrt(2 (9 - 1)) = 25 % (IEEE Std 952, annex C)
 INSTABILITY_FLOOR = 2.0 * np.log(2.0) / np.pi  # Allan variance of a bias instability of 1 (IEEE Std 952)
 
 
@@ -99,7 +102,8 @@ def noise_figures(sensor: str, sheet: SensorFigures | None, document: Mapping[st
     figures["walk_origin"] = sheet.noise_origin or "for the bias wander of the sensor's configuration"
     if not axes:
         return figures
-    of_white, walks = zip(*map(_white_and_walk, axes), strict=True)
+    longest_s = identified["length_s"] / FEWEST_AVERAGES
+    of_white, walks = zip(*(_white_and_walk(terms, longest_s) for terms in axes), strict=True)
     whites = [w for w in of_white if w is not None]
     if whites:
         figures["white"], *figures["white_interval"] = _rms(whites)
@@ -125,8 +129,11 @@ def noise_figures(sensor: str, sheet: SensorFigures | None, document: Mapping[st
     return figures
 
 
-def _white_and_walk(terms: JSON) -> list[Values | None]:
-    """Return white noise and walk of an axis, each with the ends of its interval, (3,); None without a term."""
+def _white_and_walk(terms: JSON, longest_s: float) -> list[Values | None]:
+    """Return white noise and walk of an axis, each with the ends of its interval, (3,); None without a term.
+
+    ``longest_s``: the longest averaging time measured.
+    """
 
     def intervals(*parts: JSON) -> list[Values]:
         return [np.array([p["value"], *p["interval"]], float) for p in parts if p["value"] is not None]
@@ -139,7 +146,7 @@ def _white_and_walk(terms: JSON) -> list[Values | None]:
         for value in intervals(part)
     ]
     slow = [
-        np.sqrt(2.0 / time) * value
+        np.sqrt(3.0 * allan_variance("gauss_markov", 1.0, np.array([longest_s]), time)[0] / longest_s) * value
         for part, time in processes
         if time >= MIN_EXPORTED_TIME_S
         for value in intervals(part)

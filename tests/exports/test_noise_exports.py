@@ -138,7 +138,7 @@ def test_a_process_is_white_or_a_walk_by_its_correlation_time_and_flicker_meets_
             "interval": [0.4, 0.6],
             "correlation_time_s": {"value": time, "interval": [time, time]},
         }
-        tau = np.array([100.0 * time]) if time < 1.0 else np.array([time / 1000.0])
+        tau = np.array([100.0 * time if time < 1.0 else 1e3 / 9.0])  # the longest time of a rest of 1000 s
         n, k = exported(gauss_markov=[process])
         exact = allan_variance("gauss_markov", 0.5, tau, time)[0]
         found = (n**2 - 4.0) / tau[0] if time < 1.0 else k**2 * tau[0] / 3.0
@@ -173,3 +173,21 @@ def test_a_conversion_keeps_the_densities(measured: dict[str, Any], tmp_path: Pa
     found = read_any(tmp_path / "kalibr.yaml")
     again = noise(with_noise({}, found), document_of(found))
     assert again == pytest.approx(noise(SHEETS, measured), rel=1e-9)
+
+
+def test_the_walk_of_a_short_process_holds_at_the_longest_time_measured() -> None:
+    """Of a process of 0.3 s a walk with its increments would reach 80 times its size in 1000 s."""
+    rng, length, time, size = np.random.default_rng(4), SAMPLES / RATE, 0.3, 0.2
+    keep = np.exp(-1.0 / (RATE * time))
+    drive = np.sqrt(1.0 - keep**2) * rng.standard_normal((SAMPLES, 3))
+    values = 0.1 * rng.standard_normal((SAMPLES, 3)) + size * lfilter([1.0], [1.0, -keep], drive, axis=0)
+    made = document(dict.fromkeys(SENSORS, values))
+    found = noise(SHEETS, made)
+    factor = np.pi / 180.0
+    walk, white = (found[f"gyroscope_{k}"] / factor for k in ("random_walk", "noise_density"))  # type: ignore[operator]
+    averages = values[: SAMPLES // 9 * 9].reshape(9, -1, 3).mean(axis=1)  # of the longest averaging time, 133 s
+    seen = 0.5 * np.mean(np.diff(averages, axis=0) ** 2)
+    longest = length / 9.0
+    implied = white**2 / longest + walk**2 * longest / 3.0
+    assert 0.4 * seen < implied < 2.5 * seen  # 8 differences of each of 3 axes: 35 %
+    assert walk * np.sqrt(1000.0) < 3.0 * size
