@@ -48,6 +48,7 @@ EFFECT_IN_C = re.compile(r"r\[\d\] -= .*/\* (\w+) \*/")  # a line of calibration
 TURNED_READINGS = re.compile(r"Turn\s+the\s+readings\s+to\s+body\s+axes\s+first:\s[^.]*\.")  # a remark in our exports
 OWNER = re.compile(r"the (\w+)'s x along")  # in such a remark: a sensor, or "sensor" for both
 BODY_AXIS = re.compile(r"along body ([+-][xyz])")
+NOISE_ALONE = re.compile(r"^\s*(accelerometer|gyroscope)_noise_density\s*:", re.MULTILINE)  # Kalibr's imu.yaml
 FORMAT_ROUNDING = 1e-12  # rounding errors of the formats' arithmetic, relative to the largest number
 
 
@@ -172,6 +173,9 @@ def _recognised(file: Path, text: str) -> str:
             fitting = [CALIBRATION]
     if len(fitting) == 1:
         return fitting[0]
+    if NOISE_ALONE.search(text):
+        message = "holds the noise of a sensor for a filter, and no calibration; name Kalibr's result in its place"
+        raise InputError(message, str(file))
     names = ", ".join(fitting or [CALIBRATION, *declarations])
     reason = "the file fits several formats" if fitting else "the file has the keys of no format"
     raise InputError(f"{reason}: {names}; name it (convert --from, method.format)", str(file))
@@ -181,7 +185,11 @@ def _sensors_in(file: Path, declared: Format, content: Node) -> dict[str, dict[s
     """Return the expressions for the sensors in a file."""
     read_back, endings = declared.read_back, declared.sensor_endings
     expressions = {s: read_back["sensor"] for s in endings if file.stem.endswith(endings[s])} or read_back
-    return {s: dict(expressions[s]) for s in SENSORS if s in expressions and content.has(expressions[s]["where"])}
+    return {
+        s: dict(expressions[s])
+        for s in SENSORS
+        if s in expressions and any(map(content.has, expressions[s]["where"].split(" | ")))
+    }
 
 
 def _read(
@@ -202,8 +210,11 @@ def _read(
         raise InputError(
             f"{format_name} is in counts: state the sensor, whose config states the counts per unit", str(file)
         )
-    tree = Expressions({**FUNCTIONS, "file": content, "counts": per_unit})
-    notes: list[str] = []
+    omitted = {k: v for k, v in declared.read_back.get("defaults", {}).items() if k not in content}
+    notes = (
+        [f"not in the file, so the default: {', '.join(f'{k} = {v:g}' for k, v in omitted.items())}"] if omitted else []
+    )
+    tree = Expressions({**FUNCTIONS, "file": Node({**content, **omitted}), "counts": per_unit})
     calibrations = {}
     for s, expressions in sensors.items():
         tree.globals |= {key: tree.value(e) for key, e in declared.read_back.get("let", {}).items()}

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 ARRAY = re.compile(r"(\w+)\s*(?:\[\d*\]\s*)*=\s*(\{[^;]*\})\s*;")
+NO_UNIT = (None, "", "a.u.")  # of imucal: the readings may be counts
 DEFINE = re.compile(r'<define\s+name="(\w+)"\s+value="([^"]*)"')
 
 
@@ -127,7 +128,8 @@ def parsed(kind: str, text: str) -> Node:
 def _parameters(text: str) -> dict[str, Any]:
     parameters: dict[str, Any] = {}
     for line in text.splitlines():
-        words = re.split(r"[\s,=]+", line.partition("#")[0].strip().removeprefix("set ").strip())
+        stated = line.partition("#")[0].strip().removeprefix("param ").removeprefix("set ")  # PX4's and INAV's commands
+        words = re.split(r"[\s,=]+", stated.strip())
         if len(words) == 5 and words[0].isdigit() and words[1].isdigit():
             words = words[2:4]
         if len(words) < 2 or not re.match(r"[A-Za-z]", words[0]):
@@ -253,8 +255,8 @@ FUNCTIONS: dict[str, Any] = {
     "axes": axes,
     "diagonal": np.diag,
     "given": lambda node, key, default: node.get(key, default),
-    "in_dps": lambda unit: 1.0 / FACTORS[unit],
-    "in_g": lambda unit: 1.0 / FACTORS[unit],
+    "in_dps": lambda unit: 1.0 / (1.0 if unit in NO_UNIT else FACTORS[unit]),
+    "in_g": lambda unit: 1.0 / (1.0 if unit in NO_UNIT else FACTORS[unit]),
     "lower": lower,
     "product": product,
     "rotation": rotation,

@@ -8,6 +8,7 @@ coarse to differentiate.
 
 from __future__ import annotations
 
+import glob
 import itertools
 import os
 from dataclasses import replace
@@ -65,7 +66,9 @@ def read_recordings(
         entry = procedure.recordings[name]
         files, wanted, unread = _existing(candidates, folder) if name not in in_memory else ([name], [name], [])
         if not files:
-            missing += [] if entry.optional else [f"{name} (tried {tried(candidates)})"]
+            missing += (
+                [] if entry.optional else [f"{name} (tried {tried(candidates)}){_of_other_suffix(name, entry, folder)}"]
+            )
             continue
         found.add(name)
         if files != wanted:
@@ -139,6 +142,14 @@ def _existing(candidates: Sequence[Sequence[str]], folder: Path) -> tuple[list[s
     present = [[f for f in c if os.path.exists(os.path.join(here, f))] for c in candidates]  # noqa: PTH110, PTH118
     files, wanted = next(((f, list(c)) for f, c in zip(present, candidates, strict=True) if f), ([], []))
     return files, wanted, [f for existing in present for f in existing if f not in files]
+
+
+def _of_other_suffix(name: str, entry: RecordingFile, folder: Path) -> str:
+    """Return what names a file of a recording that has another suffix; empty for none."""
+    others = sorted(f.name for f in folder.glob(f"{glob.escape(entry.file)}.*") if f.is_file())
+    if not others:
+        return ""
+    return f": {', '.join(others)} lies there; rename it, or set procedure.recordings.{name}.file={others[0]}"
 
 
 def tried(candidates: Sequence[Sequence[str]]) -> str:

@@ -142,6 +142,8 @@ def read_calibration(file: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise MissingInputError("there is no such calibration", str(file)) from None
     except (OSError, RecursionError, ValueError) as error:  # ValueError: no UTF-8, no JSON, or refused below
+        if file.suffix.lower() != ".json":
+            _refuse(file, f"this is no calibration of a unit: make one of it by convert {file} calibration.json")
         _refuse(file, f"this is no calibration of a unit: {error}; {WHAT_TO_DO}")
     if not isinstance(document, dict) or "status" not in document:
         _refuse(file, "this is no calibration of a unit: it has no status; expected calibrations/<unit>.json")

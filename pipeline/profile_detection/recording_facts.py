@@ -23,7 +23,7 @@ from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
 from pipeline.preprocessing.bench import other_axes
 from pipeline.profile_detection.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS
-from pipeline.signal.rests import rests_from_table, runs
+from pipeline.signal.rests import SHORTEST_REST_S, rests_from_table, runs
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -164,7 +164,13 @@ def _describe_rests(recording: Recording, rests: Sequence[tuple[int, int]]) -> s
     if len(rests) == 1:
         whole = rests[0][1] - rests[0][0] > 0.9 * recording.samples
         return f"1, of {_number(lengths[0], 3)} s" + (": the sensor did not move" if whole else "")
-    return f"{len(rests)}, {_number(lengths.min(), 2)} to {_number(lengths.max(), 3)} s long"
+    text = f"{len(rests)}, {_number(lengths.min(), 2)} to {_number(lengths.max(), 3)} s long"
+    short = int(np.count_nonzero(lengths < SHORTEST_REST_S))
+    by_hand = recording.role == "rests" and not _turns(recording)
+    return text + (
+        f"; {short} of them are shorter than {SHORTEST_REST_S:g} s, and a run does not use them"
+        * (by_hand and short > 0)
+    )
 
 
 def _clipping(recording: Recording, sensor: Sensor | None) -> str:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.__main__ import main
 from pipeline.io.write import write_recording
+from pipeline.profile_detection.recording_facts import facts
 from pipeline.records import Recording
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import description_from
@@ -528,3 +529,20 @@ def test_what_rests_by_hand_do_not_determine_is_told(tmp_path: Path, capsys: pyt
     checked = Checked(capsys, "--campaign", tmp_path)
     assert checked.code == 0
     assert "accelerometer the rests do not determine misalignment_yx, misalignment_zx, misalignment_zy" in checked.words
+
+
+def test_the_kind_of_a_log_that_is_cut_short_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "log.h5"
+    log.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(40))
+    checked = Checked(capsys, log, "--ingest", "array_file")
+    assert checked.code == 2
+    assert "kind an HDF5 file, by its first bytes" in checked.words
+
+
+def test_rests_that_a_run_does_not_use_are_counted() -> None:
+    rng = np.random.default_rng(1)
+    up = np.repeat(np.vstack([np.eye(3), -np.eye(3)] * 5), 80, axis=0)  # 0.8 s each
+    time_ns = np.arange(len(up)) * 10_000_000
+    readings = up + 1e-3 * rng.standard_normal(up.shape), 0.05 * rng.standard_normal(up.shape)
+    rests = dict(facts(Recording("recording", "rests", None, time_ns, *readings)))["rests"]
+    assert "of them are shorter than 1 s, and a run does not use them" in rests

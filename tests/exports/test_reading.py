@@ -18,6 +18,7 @@ from pipeline.exports import formats
 from pipeline.exports.conversion import SAMPLE, explain_calibration
 from pipeline.exports.reading import read_any
 from pipeline.field_logs.stream import LogProfile
+from pipeline.model.calibration_file import read_calibration
 from pipeline.records import SENSORS, SensorCalibration
 
 G0, RADIAN = 9.80665, np.pi / 180.0
@@ -305,3 +306,50 @@ def test_the_worked_sample_of_an_explanation_is_what_apply_gives(folder: Path) -
         np.testing.assert_allclose([float(x) for x in numbers.split(",")], getattr(expected, s), rtol=1e-8)
     assert "calibrated = matrix (reading - bias - g_sensitivity - bias_temperature), deg/s" in text
     assert "x: 0.1 * f[0] + -0.02 * f[1] + 0.03 * f[2]" in text
+
+
+def test_a_diff_of_inav_omits_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "diff.txt"
+    file.write_text(
+        "# diff\nset acczero_x = 12\nset acczero_z = -40\nset accgain_y = 4100\nset gyro_hardware_lpf = 256HZ\n"
+    )
+    found = read_any(file, None, {"accelerometer": 2048.0, "gyroscope": 16.4})
+    assert found.format_name == "inav.txt"
+    np.testing.assert_allclose(found.sensors["accelerometer"].bias, np.array([12, 0, -40]) / 2048.0)
+    np.testing.assert_allclose(np.diag(found.sensors["accelerometer"].matrix), [1.0, 4100 / 4096, 1.0])
+    assert "acczero_y = 0" in found.notes[0]
+
+
+def test_commands_of_px4s_console_are_parameters(tmp_path: Path) -> None:
+    file = tmp_path / "px4.txt"
+    lines = [f"param set CAL_ACC0_{a}OFF 0.{i}" for i, a in enumerate("XYZ", 1)]
+    lines += [f"param set CAL_ACC0_{a}SCALE 1.0{i}" for i, a in enumerate("XYZ", 1)]
+    file.write_text("\n".join(lines))
+    found = read_any(file)
+    assert found.format_name == "px4.params"
+    np.testing.assert_allclose(found.sensors["accelerometer"].bias * 9.80665, [0.1, 0.2, 0.3])
+
+
+def test_readings_without_a_unit_are_the_counts_of_the_stated_sensor(tmp_path: Path) -> None:
+    content = {
+        "K_a": np.diag([208.0, 209.0, 210.0]).tolist(), "R_a": np.eye(3).tolist(), "b_a": [10.0, 0.0, -20.0],
+        "K_g": np.diag([16.4, 16.5, 16.3]).tolist(), "R_g": np.eye(3).tolist(), "b_g": [3.0, 0.0, 1.0],
+        "K_ga": np.zeros((3, 3)).tolist(), "acc_unit": "m/s^2", "gyr_unit": "deg/s", "from_acc_unit": "a.u.",
+    }  # fmt: skip
+    file = tmp_path / "imucal.json"
+    file.write_text(json.dumps(content))
+    found = read_any(file, None, {"accelerometer": 2048.0, "gyroscope": 16.4})
+    np.testing.assert_allclose(found.sensors["accelerometer"].bias, np.array([10.0, 0.0, -20.0]) / 2048.0)
+    with pytest.raises(InputError, match="state it"):
+        read_any(file)
+
+
+def test_what_holds_no_calibration_says_so(tmp_path: Path) -> None:
+    (tmp_path / "imu.yaml").write_text(
+        "accelerometer_noise_density: 0.01\naccelerometer_random_walk: 0.001\nrostopic: /imu0\n"
+    )
+    with pytest.raises(InputError, match="noise of a sensor for a filter, and no calibration"):
+        read_any(tmp_path / "imu.yaml")
+    (tmp_path / "kalibr.yaml").write_text("imu0:\n  model: scale-misalignment\n")
+    with pytest.raises(InputError, match=r"convert .*kalibr\.yaml calibration\.json"):
+        read_calibration(tmp_path / "kalibr.yaml")

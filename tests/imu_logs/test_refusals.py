@@ -313,3 +313,9 @@ def test_counts_that_are_not_whole_are_read_as_numbers(tmp_path: Path) -> None:
     assert recording.accelerometer is not None
     assert recording.accelerometer[0, 0] == 0.5 / 16384
     np.testing.assert_array_equal(recording.time_ns, [0, 10_000_000])
+
+
+def test_a_file_of_another_suffix_is_named(tmp_path: Path, canonical: dict[str, Any]) -> None:
+    (tmp_path / "a.txt").write_text("time_s\n")
+    with pytest.raises(MissingInputError, match=r"a\.txt lies there; .* procedure\.recordings\.a\.file=a\.txt"):
+        read_recordings(procedure("a"), ingest_of(canonical), SENSOR, tmp_path)
