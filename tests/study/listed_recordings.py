@@ -141,7 +141,38 @@ def turns(unit: Unit, sensors: str) -> None:
             unit.write(f"turn_{axis}_{k}", f"turn,{axis},{shown},{accuracy:.3g},", *joined(*parts), sensors)
 
 
-KINDS = {"turns": lambda unit: turns(unit, "ag"), "turns_gyroscope": lambda unit: turns(unit, "g")}
+def attitudes(unit: Unit) -> None:
+    """Means of 12 to 50 attitudes of the accelerometer, one row each, averaged over half a second to ten."""
+    rng, count = unit.rng, int(unit.rng.integers(12, 51))
+    up = np.array([sphere(rng) for _ in range(count)])
+    seconds = rng.uniform(0.5, 10.0)
+    noise = WHITE["accelerometer"] / np.sqrt(RATE_HZ * seconds), WANDER["accelerometer"]
+    mean = unit.bias["accelerometer"] + up @ unit.K["accelerometer"].T + np.hypot(*noise) * rng.normal(size=(count, 3))
+    np.savetxt(
+        unit.folder / "means.csv", mean, fmt="%.9g", delimiter=",", header="accel_x_g,accel_y_g,accel_z_g", comments=""
+    )
+    unit.rows.append("means.csv,attitudes,,,,")
+
+
+def slow(unit: Unit) -> None:
+    """Slow movement through all attitudes for one to four minutes, with accelerations of 2 to 20 mg."""
+    rng, n = unit.rng, round(unit.rng.uniform(60.0, 240.0) * RATE_HZ)
+    time, force = np.arange(n) / RATE_HZ, np.empty((n, 3))
+    swings = [sum(rng.uniform(0.5, 1.0) * np.sin(2.0 * np.pi * rng.uniform(0.02, 0.06) * time + p) for p in phase)
+              for phase in rng.uniform(0.0, 2.0 * np.pi, (2, 3))]  # fmt: skip
+    around, above = np.pi * swings[0], 1.2 * swings[1]
+    force = np.column_stack([np.cos(above) * np.cos(around), np.cos(above) * np.sin(around), np.sin(above)])
+    keep = np.exp(-1.0 / (RATE_HZ * 0.3))
+    shaken = scipy.signal.lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.normal(size=(n, 3)), axis=0)
+    unit.write("slow", "slow,,,,", force + rng.uniform(0.002, 0.02) * shaken, np.zeros((n, 3)), "a")
+
+
+KINDS = {
+    "turns": lambda unit: turns(unit, "ag"),
+    "turns_gyroscope": lambda unit: turns(unit, "g"),
+    "attitudes": attitudes,
+    "slow": slow,
+}
 
 
 def run(kind: str, seed: int, number: int) -> dict[str, list[tuple[str, float, bool]]]:
