@@ -27,6 +27,7 @@ from pipeline.model.sensor_file import settings_of_ranges
 from pipeline.one_unit import try_unit, unit_of_campaign
 from pipeline.outcome import NAMED_PER_LINE, as_overrides, found_mountings
 from pipeline.profile_detection.recording_facts import as_text, counted, facts, topic_lines
+from pipeline.profile_detection.sheet_proposal import proposed_sheet
 from pipeline.profile_detection.unit_guesses import propose
 from pipeline.records import SENSORS
 from pipeline.run_progress import Countdown
@@ -343,6 +344,11 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
         file = [("file", trial.failure["file"])] if trial.failure["file"] else []
         lines = [*file, ("REFUSED", trial.failure["message"]), ("code", trial.failure["code"])]
         texts.append(f"unit {unit} of campaign {campaign.name}\n{as_text(lines)}")
+        config, folder = campaign.units[unit].config, campaign.folder(unit)
+        if config.procedure.sheet and not config.procedure.recordings and folder.is_dir():
+            proposed = proposed_sheet(folder, config)
+            head = f"PROPOSED {folder / config.procedure.sheet}, by what the files show; correct it:"
+            texts += [f"{head}\n\n{proposed}"] if proposed else []
     elif not names and not refused:
         document = trial.state.calibration or {}
         lines = [(sensor, f"null: {reason}") for sensor, reason in document["not_calibrated"].items()]
