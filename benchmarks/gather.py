@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.config import load_campaign, settings_of_jobs
-from pipeline.pack import STAGES, Pack, new_pack
+from pipeline.pack import PACKED_STEPS, Pack, new_pack
 
 ROOT = Path(__file__).resolve().parents[1]
 SCATTER_G = 1e-3
@@ -57,7 +57,7 @@ def small(folder: Path, units: int) -> Path:
 
 def replicate(source: Path, names: list[str], target: Path, rng: np.random.Generator) -> None:
     """Write the packs of a batch of these names from those of other units."""
-    packs = {stage: Pack(source / f"{stage}.zip") for stage in STAGES}
+    packs = {stage: Pack(source / f"{stage}.zip") for stage in PACKED_STEPS}
     known = [n.removesuffix(".json") for n in packs["calibration"].names()]
     members = {
         (stage, unit): [n for n in pack.names() if n.partition("/")[0].startswith(unit) or f"/{unit}." in n]

@@ -127,12 +127,12 @@ def calibrate_unit(
         require_simulated,
         unit_of_campaign,
     )
-    from pipeline.outcome import RESULTS  # noqa: PLC0415
+    from pipeline.outcome import DEFAULT_RESULTS  # noqa: PLC0415
     from pipeline.result import UnitResult  # noqa: PLC0415
 
     settings: Mapping[str, Any] = {
         "campaign": str(campaign),
-        "results": "" if str(results) == RESULTS else str(results),
+        "results": "" if str(results) == DEFAULT_RESULTS else str(results),
         "overrides": as_list(overrides, "overrides"),
         "python_effects": files_of_effects(python_effects),
     }

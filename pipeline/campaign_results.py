@@ -13,35 +13,41 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
 from pipeline.errors import InputError, MissingInputError
-from pipeline.files import read_json, text_of_cell
-from pipeline.pack import DOCUMENTS, read_published
+from pipeline.files import JSON, read_json, text_of_cell
+from pipeline.pack import DOCUMENT_FOLDERS, read_published
 from pipeline.records import SENSORS
-from pipeline.report.parameters import COLUMNS, fitted_parameters, reading_errors
+from pipeline.report.parameters import SUMMARY_COLUMNS, fitted_parameters, reading_errors
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-JSON = dict[str, Any]
-PARAMETERS = ("parameter", "value", "value_unit", "expanded_uncertainty", "coverage_factor", "uncertainty_with_open")
-ERRORS = (
+COLUMNS_OF_PARAMETERS = (
+    "parameter",
+    "value",
+    "value_unit",
+    "expanded_uncertainty",
+    "coverage_factor",
+    "uncertainty_with_open",
+)
+ERROR_COLUMNS = (
     "step", "rms_error", "mean_abs_error", "max_error", "min_error", "sum_abs_error", "change_percent",
     "vector_rms_error", "noise_floor", "vector_noise_floor",
 )  # fmt: skip
 DIAGNOSIS = ("verdict", "residual_over_noise", "selected", "reason", "next_experiment", "override")
-EFFECTS = (
+EFFECT_COLUMNS = (
     "effect", "delta_bic", "p_value", "explained_share", "held_out_error_before", "held_out_error_after", "plausible",
     "selected", "look_alikes",
 )  # fmt: skip
 CHIPS = ["board", "reference", "unit", "parameter", "value", "value_unit", "expanded_uncertainty", "observable"]
-NOISE = (
+NOISE_COLUMNS = (
     "axis", "term", "value", "value_unit", "low", "high", "upper_limit", "correlation_time_s", "frequency_hz", "reason",
 )  # fmt: skip
-FIGURES = ("_before", "_after", "_floor", "_answers")  # endings of the columns of summary.csv that hold numbers
+FIGURE_ENDINGS = ("_before", "_after", "_floor", "_answers")  # endings of the columns of summary.csv that hold numbers
 
 
 @dataclass(frozen=True)
@@ -95,7 +101,9 @@ class CampaignResults:
         ``_not_in_uncertainty``, ``_not_held_out`` (why nothing was held out); ``pass``; ``left_out`` (rows that no
         fit uses); ``incomplete`` (stages after the fit that failed, and why); and other columns of ``units.csv``.
         """
-        kinds = {name: "float" if name.endswith(FIGURES) else "str" for name in COLUMNS} | {"pass": "boolean"}
+        kinds = {name: "float" if name.endswith(FIGURE_ENDINGS) else "str" for name in SUMMARY_COLUMNS} | {
+            "pass": "boolean"
+        }
         table = pd.read_csv(self.folder / "summary.csv", dtype=kinds, keep_default_na=False, na_values=[""])
         texts = [column for column in table if pd.api.types.is_string_dtype(table[column])]
         table[texts] = table[texts].map(text_of_cell, na_action="ignore")
@@ -114,11 +122,11 @@ class CampaignResults:
         ``cross_axis_xy`` (what axis x reads of a truth along y).
         """
         rows = (
-            about | dict(zip(PARAMETERS, parameter, strict=True))
+            about | dict(zip(COLUMNS_OF_PARAMETERS, parameter, strict=True))
             for about, part in self._parts("calibration")
             for parameter in fitted_parameters(part) + reading_errors(part)
         )
-        return pd.DataFrame(rows, columns=["unit", "sensor", *PARAMETERS])
+        return pd.DataFrame(rows, columns=["unit", "sensor", *COLUMNS_OF_PARAMETERS])
 
     @cached_property
     def errors(self) -> pd.DataFrame:
@@ -134,7 +142,7 @@ class CampaignResults:
             for about, part in self._parts("validation")
             for step in part.get("steps") or []
         )
-        return pd.DataFrame(rows, columns=["unit", "sensor", *ERRORS])
+        return pd.DataFrame(rows, columns=["unit", "sensor", *ERROR_COLUMNS])
 
     @cached_property
     def diagnosis(self) -> pd.DataFrame:
@@ -166,7 +174,7 @@ class CampaignResults:
             for about, part in self._parts("diagnosis")
             for entry in part.get("ranking") or []
         )
-        return pd.DataFrame(rows, columns=["unit", "sensor", *EFFECTS])
+        return pd.DataFrame(rows, columns=["unit", "sensor", *EFFECT_COLUMNS])
 
     @cached_property
     def noise(self) -> pd.DataFrame:
@@ -186,7 +194,7 @@ class CampaignResults:
             for name, parts in (identified["terms"] or {}).items()
             for part in (parts if isinstance(parts, list) else [parts])
         )
-        return pd.DataFrame(rows, columns=["unit", "sensor", *NOISE])
+        return pd.DataFrame(rows, columns=["unit", "sensor", *NOISE_COLUMNS])
 
     @cached_property
     def chips(self) -> pd.DataFrame:
@@ -212,7 +220,7 @@ class CampaignResults:
             if name not in self.units:
                 near = get_close_matches(name, self.units, n=5) or self.units[:5]
                 raise InputError(f"has no unit {name!r}; there are {', '.join(near)}", str(self.folder))
-            folder, *others = DOCUMENTS
+            folder, *others = DOCUMENT_FOLDERS
             calibration = self._document(folder, name)
             ok = calibration["status"] == "ok"
             self._documents[name] = UnitResults(

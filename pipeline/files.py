@@ -13,9 +13,11 @@ import os
 import re
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pipeline.errors import DamagedFileError
+
+JSON: TypeAlias = dict[str, Any]  # a document, or a part of one
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -25,14 +25,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import InputError, first
-from pipeline.files import write_json
+from pipeline.files import JSON, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-JSON = dict[str, Any]
-FOLDER = "history"
+HISTORY_FOLDER = "history"
 VALUES = "values"  # key of a state: the values of each configuration section
 DIGEST_DIGITS = 16  # of a digest
 MAX_VALUE_LENGTH = 60  # characters of a value; a longer one is cut and ends in its digest
@@ -132,7 +131,7 @@ def _largest(uncertainty: Mapping[str, Any]) -> dict[str, float]:
 def read_history(results: Path) -> list[JSON]:
     """Return the history of a campaign, oldest entry first; ``InputError`` if a file is not an entry."""
     entries = []
-    for file in sorted((results / FOLDER).glob("[0-9]*.json")):
+    for file in sorted((results / HISTORY_FOLDER).glob("[0-9]*.json")):
         try:
             entry = json.loads(file.read_text(encoding="utf-8"))
             valid = isinstance(entry["run"], int) and isinstance(entry["units"], dict)
@@ -174,7 +173,7 @@ def record(
             "gone": gone,
             "sections": new,
         }
-        write_json(results / FOLDER / f"{number:04d}.json", entry)
+        write_json(results / HISTORY_FOLDER / f"{number:04d}.json", entry)
         entries.append(entry)
     return entries
 

@@ -15,7 +15,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.errors import first
-from pipeline.files import INSTALLED, read_json, text_of_cell
+from pipeline.files import INSTALLED, JSON, read_json, text_of_cell
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
 from pipeline.verdicts import FAILED, KINDS, READY, SETTING, WITH_THEM, Verdict, error_in_row, kinds_of, problems
 
@@ -27,18 +27,17 @@ if TYPE_CHECKING:
 
     Ways = Sequence[Sequence[str]]
 
-JSON = dict[str, Any]
-UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
-ZERO = re.compile(r"(?<=zero_deg=)-?[0-9.]+")
+SENSOR_UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
+ZERO_SETTING = re.compile(r"(?<=zero_deg=)-?[0-9.]+")
 ALIKE_DEG = 0.1  # gravity shows a zero to some hundredths of a degree (docs/mounting.md, What is checked)
 NAMED_PER_LINE = 5  # units that a line names, and lines of one kind
 NAMED_MISSING = 10  # units with a missing effect that the last lines name
 SMALLEST_CHANGE = 0.02  # relative change of an error that is reported
-PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes in YAML, also within brackets
+PLAIN_YAML_TEXT = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes in YAML, also within brackets
 NOT_TEXT = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}  # words that YAML reads as another type
-EFFECTS = re.compile(r"effects\.(accelerometer|gyroscope)=\[(.*)\]")
+EFFECTS_OVERRIDE = re.compile(r"effects\.(accelerometer|gyroscope)=\[(.*)\]")
 NOT_CONVERGED = "the fit did not converge: parameters and uncertainties are in doubt"
-RESULTS = "results"  # the default folder of results
+DEFAULT_RESULTS = "results"  # the default folder of results
 
 
 class FoundMounting(NamedTuple):
@@ -62,8 +61,8 @@ def found_mountings(found: Iterable[tuple[str, Mapping[str, Ways]]]) -> list[Fou
         if not recordings:
             continue
         ways = [[*way] for way in next(iter(recordings.values()))]
-        zeros = [float(text) for way in ways for setting in way for text in ZERO.findall(setting)]
-        plain = [[ZERO.sub("", setting) for setting in way] for way in ways]
+        zeros = [float(text) for way in ways for setting in way for text in ZERO_SETTING.findall(setting)]
+        plain = [[ZERO_SETTING.sub("", setting) for setting in way] for way in ways]
         for group, known in groups:
             near = all(abs(a - b) <= ALIKE_DEG for a, b in zip(zeros, known[0], strict=False))
             if near and (group.recordings, group.ways) == ([*recordings], plain):
@@ -135,7 +134,7 @@ def lines_of(groups: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
 
 
 def commands_of(
-    part: Mapping[str, Any], sensor: str, unit: str, settings: Mapping[str, Any], results: str = RESULTS
+    part: Mapping[str, Any], sensor: str, unit: str, settings: Mapping[str, Any], results: str = DEFAULT_RESULTS
 ) -> JSON:
     """Return the commands that add the effects which a diagnosis selected; ``{}`` if it selected none.
 
@@ -154,7 +153,7 @@ def commands_of(
     }
 
 
-def command_of(problem: Problem, settings: Mapping[str, Any], results: str = RESULTS) -> str:
+def command_of(problem: Problem, settings: Mapping[str, Any], results: str = DEFAULT_RESULTS) -> str:
     """Return the command with which the user can continue: it adds, runs again, or shows the evidence."""
     units, overrides = problem.units, SETTING.findall(problem.step)
     if problem.kind == Verdict.MISSING_EFFECT:
@@ -162,7 +161,7 @@ def command_of(problem: Problem, settings: Mapping[str, Any], results: str = RES
             return add_command(settings, units[0], problem.effects, results)
         names = {effect.partition(".")[2] for effect in problem.effects}
         return _command("add", settings, ["--missing", *(names if len(names) == 1 else ())], results)
-    again = dict(settings) | ({"results": results} if results != RESULTS else {})
+    again = dict(settings) | ({"results": results} if results != DEFAULT_RESULTS else {})
     if problem.kind == FAILED:
         return run_command(again)
     if overrides and len(units) <= NAMED_PER_LINE:
@@ -172,7 +171,7 @@ def command_of(problem: Problem, settings: Mapping[str, Any], results: str = RES
     return explain_command(settings, [units[0]], results)
 
 
-def explain_command(settings: Mapping[str, Any], words: Sequence[str], results: str = RESULTS) -> str:
+def explain_command(settings: Mapping[str, Any], words: Sequence[str], results: str = DEFAULT_RESULTS) -> str:
     """Return the command that shows the evidence for some units, or with ``--all`` for every unit."""
     campaign = str(settings.get("campaign", "demo")).rstrip("/")
     return _command("explain", {"campaign": campaign}, words, results)
@@ -293,8 +292,8 @@ def _changes(entries: Sequence[JSON]) -> list[str]:
             words = ", ".join(change.words(sensor)).replace("\N{MINUS SIGN}", "-").replace("\N{RIGHTWARDS ARROW}", "->")
             floor = after[sensor].get("floor")
             ratio = f", {errors[1] / floor:.3g} times the noise floor" if floor else ""
-            line = f"held-out error of the magnitude {errors[0]:.3g} -> {errors[1]:.3g} {UNITS[sensor]}{ratio}"
-            uncertainty = uncertainty_words(before[sensor], after[sensor], UNITS[sensor])
+            line = f"held-out error of the magnitude {errors[0]:.3g} -> {errors[1]:.3g} {SENSOR_UNITS[sensor]}{ratio}"
+            uncertainty = uncertainty_words(before[sensor], after[sensor], SENSOR_UNITS[sensor])
             line += f"\n  {uncertainty}" if uncertainty else ""
             lines.append((factor, f"{unit}, {sensor}: {words}; {line}"))
     return [line for _, line in sorted(lines, key=lambda entry: -entry[0])]
@@ -327,18 +326,18 @@ def run_command(settings: Mapping[str, Any]) -> str:
     ``settings``: those of ``--config``: ``campaign``, ``overrides``, ``unit_overrides``, ``results`` ...
     """
     if INSTALLED:
-        return _command("run", settings, [], str(settings.get("results") or RESULTS))
+        return _command("run", settings, [], str(settings.get("results") or DEFAULT_RESULTS))
     return shlex.join(["snakemake", "--cores", "2", *_config(settings)])
 
 
 def apply_command(settings: Mapping[str, Any], unit: str) -> str:
     """Return the command that compensates a log with the calibration of a unit, for the default folder of results."""
     campaign = str(settings.get("campaign", "demo")).rstrip("/").rpartition("/")[2]
-    file = f"{RESULTS}/{campaign}/calibrations/{unit}.json"
+    file = f"{DEFAULT_RESULTS}/{campaign}/calibrations/{unit}.json"
     return shlex.join([*_program(), "apply", "--calibration", file, "LOG.csv", "-o", "COMPENSATED.csv"])
 
 
-def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], results: str = RESULTS) -> str:
+def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], results: str = DEFAULT_RESULTS) -> str:
     """Return the command that adds effects (``sensor.effect``) to the file of a unit and runs the campaign.
 
     It also adds the effects that ``unit_overrides`` sets for this run, because that override has precedence.
@@ -346,7 +345,7 @@ def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], 
     overrides = dict(settings.get("unit_overrides") or {})
     others, given = [], []
     for override in overrides.pop(unit, []):
-        if match := EFFECTS.fullmatch(override):
+        if match := EFFECTS_OVERRIDE.fullmatch(override):
             given += [f"{match[1]}.{name.strip()}" for name in match[2].split(",") if name.strip()]
         else:
             others.append(override)
@@ -355,18 +354,18 @@ def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], 
     return _command("add", rest, [unit, *dict.fromkeys([*given, *effects])], results)
 
 
-def once_command(settings: Mapping[str, Any], unit: str, override: str, results: str = RESULTS) -> str:
+def once_command(settings: Mapping[str, Any], unit: str, override: str, results: str = DEFAULT_RESULTS) -> str:
     """Return the command that runs the campaign once with one more override of a unit."""
     overrides = settings.get("unit_overrides") or {}
     key = override.partition("=")[0]
     others = [text for text in overrides.get(unit, []) if text.partition("=")[0] != key]
     once = {**settings, "unit_overrides": {**overrides, unit: [*others, override]}}
-    return run_command(once | ({"results": results} if results != RESULTS else {}))
+    return run_command(once | ({"results": results} if results != DEFAULT_RESULTS else {}))
 
 
 def _command(command: str, settings: Mapping[str, Any], words: Sequence[str], results: str) -> str:
     """Return a command of this package for the campaign of a run."""
-    folder = ["--results", results] if results != RESULTS else []
+    folder = ["--results", results] if results != DEFAULT_RESULTS else []
     rest = {key: value for key, value in settings.items() if key not in ("campaign", "results")}
     return shlex.join([*_program(), command, str(settings.get("campaign", "demo")), *words, *folder, *_config(rest)])
 
@@ -386,6 +385,6 @@ def _flow(value: Any, *, top: bool = False) -> str:  # noqa: ANN401  (any YAML v
         return "{" + ", ".join(f"{_flow(str(k))}: {_flow(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_flow(v) for v in value) + "]"
-    if isinstance(value, str) and (top or (PLAIN.fullmatch(value) and value.lower() not in NOT_TEXT)):
+    if isinstance(value, str) and (top or (PLAIN_YAML_TEXT.fullmatch(value) and value.lower() not in NOT_TEXT)):
         return value
     return json.dumps(value, ensure_ascii=False)

@@ -110,21 +110,21 @@ def as_bytes(content: Any) -> bytes:  # noqa: ANN401
 
 
 PACKS, WITH_PRIOR = "packs", "prior"
-STAGES = ("calibration", "validate", "diagnose", "export", "report", "summary")
+PACKED_STEPS = ("calibration", "validate", "diagnose", "export", "report", "summary")
 FAILED = ".failed.json"
 INCOMPLETE = ".incomplete.json"  # what stages after the fit could not make: a list of records as of a failure
 STAGE_OF = {  # folder of the results: the stage whose packs contain its files
     "calibrations": "calibration", "validations": "validate", "diagnoses": "diagnose", "exports": "export",
     "reports": "report", "certificates": "report",
 }  # fmt: skip
-DOCUMENTS = ("calibrations", "validations", "diagnoses")
+DOCUMENT_FOLDERS = ("calibrations", "validations", "diagnoses")
 
 
 class Batch:
     """The packs of a batch that contain the published files of its units."""
 
     def __init__(self, folder: Path) -> None:
-        self.packs = {stage: Pack(folder / f"{stage}.zip") for stage in STAGES}
+        self.packs = {stage: Pack(folder / f"{stage}.zip") for stage in PACKED_STEPS}
 
     def _of_failed(self, unit: str) -> Pack | None:
         """Return the pack with the documents of a failed unit: of the stage report or a later one; else None."""
@@ -178,7 +178,7 @@ class Batch:
         if self._of_failed(unit):
             yield f"calibrations/{unit}.json"
             return
-        yield from (f"{folder}/{unit}.json" for folder in DOCUMENTS)
+        yield from (f"{folder}/{unit}.json" for folder in DOCUMENT_FOLDERS)
         parts = self.packs["diagnose"].json(f"{unit}.json").values()
         yield from (
             f"diagnoses/{p['suggested_file']}" for p in parts if isinstance(p, dict) and p.get("suggested_file")

@@ -41,13 +41,13 @@ from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.errors import DamagedFileError, PipelineError
 from pipeline.files import exchange, flush_file_system, read_json, write_atomically
-from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch, directory_of
+from pipeline.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch, directory_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
-PUBLISHED = (
+PUBLISHED_PATHS = (
     "calibrations", "validations", "diagnoses", "reports", "certificates", "exports", "combined", "packs",
     "index.html", "summary.csv", "failures.json", "parameters.parquet", "fleet.json",
 )  # fmt: skip
@@ -55,10 +55,10 @@ BESIDE = (  # not published as a set
     "batches", "configs", "history", "logs", "simulated", "complete.json", "thesis.html",
 )  # fmt: skip
 OF_A_RUN = ("calibrations/*.json", f"{PACKS}/*/*.zip", "batches/*/*.zip", "history/*.json", "simulated/truth/*.json")
-RUN_LOCK, JOBS_LOCK, OWNER = ".run.lock", ".jobs.lock", ".owner.json"
-PACK = re.compile(rf"{PACKS}/([^/]+)/(?:{'|'.join((*STAGES, WITH_PRIOR))})\.zip")
+RUN_LOCK, JOBS_LOCK, OWNER_FILE = ".run.lock", ".jobs.lock", ".owner.json"
+PACK = re.compile(rf"{PACKS}/([^/]+)/(?:{'|'.join((*PACKED_STEPS, WITH_PRIOR))})\.zip")
 NEW_FOLDER = ".new"  # folder of a new set of files, below the results
-COMPLETE, PLAN, EXCHANGED = ".published", ".plan.json", ".exchanged.json"
+COMPLETE, PLAN_FILE, EXCHANGED = ".published", ".plan.json", ".exchanged.json"
 REPLACED = "replaced-"  # and the date: folder of the results for what a run replaced and did not write anew
 SUGGESTED_SUFFIX = "_unknown.yaml"  # end of the name of a suggested formula: <unit>_<sensor>_unknown.yaml
 DELAYED_SIGNALS = {signal.SIGINT, signal.SIGTERM}  # blocked during the exchange, which takes milliseconds
@@ -148,7 +148,7 @@ def publish(
         "every": "written" in _read_record(results, "")[1],  # whether ``before`` has every file
         "written": _states(new),
     }
-    write_atomically(new / PLAN, json.dumps(plan))
+    write_atomically(new / PLAN_FILE, json.dumps(plan))
     flush_file_system(results)
     new.rename(results / COMPLETE)
     finish_publishing(results)
@@ -176,8 +176,8 @@ def publish_simulated(folder: Path) -> None:
 def finish_publishing(results: Path) -> None:
     """Complete an interrupted publication, if there is one."""
     complete = results / COMPLETE
-    if (complete / PLAN).is_file():
-        plan = json.loads((complete / PLAN).read_text(encoding="utf-8"))
+    if (complete / PLAN_FILE).is_file():
+        plan = json.loads((complete / PLAN_FILE).read_text(encoding="utf-8"))
         before = signal.pthread_sigmask(signal.SIG_BLOCK, DELAYED_SIGNALS)
         try:
             for path, inode in plan.get("inodes", plan).items():  # 0.1.0 before schema_version 2 wrote the inodes alone
@@ -189,7 +189,7 @@ def finish_publishing(results: Path) -> None:
                 else:
                     published.parent.mkdir(parents=True, exist_ok=True)
                     new.rename(published)
-            (complete / PLAN).rename(complete / EXCHANGED)
+            (complete / PLAN_FILE).rename(complete / EXCHANGED)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
     if (complete / EXCHANGED).is_file():
@@ -212,7 +212,7 @@ def _keep_others(old: Path, results: Path, plan: Mapping[str, Any]) -> None:
     batches: dict[str, bool] = {}  # of the former packs: whether they are kept
     for path, state in _states(old).items():
         published, file = results / path, old / path
-        if path in (PLAN, EXCHANGED):
+        if path in (PLAN_FILE, EXCHANGED):
             continue
         if pack := PACK.fullmatch(path):  # of a run in any state, as it is a link to the output of a job
             batch = pack[1]
@@ -298,7 +298,7 @@ class ResultsOwner(NamedTuple):
 def read_owner(results: Path) -> ResultsOwner | None:
     """Return the owner of a results folder; None where the file is missing or damaged."""
     try:
-        found = json.loads((results / OWNER).read_text(encoding="utf-8"))
+        found = json.loads((results / OWNER_FILE).read_text(encoding="utf-8"))
         units = {str(unit): [str(digest) for digest in digests] for unit, digests in found["units"].items()}
         return ResultsOwner(str(found["campaign"]), found["simulation"], units)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -332,7 +332,7 @@ def recorded_directories(results: Path) -> set[str]:
 def write_owner(results: Path, owner: ResultsOwner) -> None:
     """Record the owner of a results folder, unless the record says so already."""
     if owner != read_owner(results):
-        write_atomically(results / OWNER, json.dumps(owner._asdict()))
+        write_atomically(results / OWNER_FILE, json.dumps(owner._asdict()))
 
 
 def record_units(results: Path, units: Mapping[str, list[str]]) -> None:
@@ -392,7 +392,7 @@ def repetitions(results: Path, output: str) -> tuple[int, list[str]]:
         return again, []  # Snakemake writes a missing output in any case
     digests = {name: _digest(_states(results / output / name)) for name in record.get("files", {})}
     changed = [name for name, digest in digests.items() if digest != record["files"][name]]
-    published = {path: s for path, s in record.get("written", {}).items() if path.partition("/")[0] in PUBLISHED}
+    published = {path: s for path, s in record.get("written", {}).items() if path.partition("/")[0] in PUBLISHED_PATHS}
     changed += [path.partition("/")[0] for path, state in published.items() if _state(results / path) != state]
     edited = [os.path.normpath(results / output / name) for name in dict.fromkeys(changed)]
     return again + bool(edited), edited

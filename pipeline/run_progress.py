@@ -49,7 +49,7 @@ PER_BATCH = (
     "summary", "prior",
 )  # fmt: skip
 AT_UNIT = re.compile(r"^[\w-]+: (\S+) \((\d+) of (\d+)\)$", re.MULTILINE)
-EFFECTS = "fit effects"
+EFFECTS_STAGE_TITLE = "fit effects"
 MIN_REMAINING_SHARE = 0.1  # least remaining time of a current unit, as a share of its usual or its elapsed time
 LAST_STAGE = "report"  # its units are counted as done
 NAMED_JOBS, NAMED_UNITS_OF_RUN = 2, 10
@@ -87,7 +87,7 @@ class RunJob:
     @property
     def kind(self) -> str:
         """Key of ``COST``."""
-        return EFFECTS if self.rule == "fit" and self.name.endswith("effects") else self.rule
+        return EFFECTS_STAGE_TITLE if self.rule == "fit" and self.name.endswith("effects") else self.rule
 
     def current_unit(self) -> tuple[str, int, float] | None:
         """Return name, number and start time of the current unit of the job; None before the first unit."""
@@ -280,7 +280,7 @@ class Monitor(logging.Handler):
         if event == "RUN_INFO":
             wanted = Counter({k: v for k, v in fields["stats"].items() if k != "total"})
             effects = min(self.effects, wanted["fit"])  # last stage of its chain: it runs if any stage does
-            self.progress.wanted = wanted + Counter({EFFECTS: effects}) - Counter({"fit": effects})
+            self.progress.wanted = wanted + Counter({EFFECTS_STAGE_TITLE: effects}) - Counter({"fit": effects})
         elif event == "JOB_INFO":
             log = Path((fields["log"] or [os.devnull])[0])
             self.progress.start(fields["jobid"], fields["rule_name"], dict(fields["wildcards"] or {}), log)

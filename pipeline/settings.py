@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Axis = Literal["x", "y", "z"]
+AxisName = Literal["x", "y", "z"]
 SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 AxisMap = Annotated[list[SignedAxis], Field(min_length=3, max_length=3)]
 Sense = Literal[1, -1]
 Kind = Literal["rest", "attitudes", "turn", "moves", "slow", "soak", "table"]  # of a file in the sheet of recordings
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Setting = TypeVar("Setting")
+SettingOfSensor = TypeVar("SettingOfSensor")
 AnySection = TypeVar("AnySection", bound="Section")
 
 
@@ -171,7 +171,7 @@ class Window(Section):
     """A part of one long recording, in s from its first sample."""
 
     role: Literal["accelerometer", "gyroscope", "rests", "validation", "static"]
-    axis: Axis | None = None
+    axis: AxisName | None = None
     start_s: NonNegative
     stop_s: Positive
 
@@ -181,7 +181,7 @@ class RecordingFile(Section):
 
     file: str
     role: Literal["accelerometer", "gyroscope", "rests", "validation", "static", "session"]
-    axis: Axis | None
+    axis: AxisName | None
     optional: bool
     up: SignedAxis | None = None
     sense: Sense | None = None
@@ -270,15 +270,15 @@ class Filter(Section):
     zero_phase: bool
 
 
-class OfSensors(Section, Generic[Setting]):
+class OfSensors(Section, Generic[SettingOfSensor]):
     """A setting of each sensor."""
 
-    accelerometer: Setting
-    gyroscope: Setting
+    accelerometer: SettingOfSensor
+    gyroscope: SettingOfSensor
 
-    def of(self, name: str) -> Setting:
+    def of(self, name: str) -> SettingOfSensor:
         """Return the setting of the accelerometer or the gyroscope."""
-        found: Setting = getattr(self, name)
+        found: SettingOfSensor = getattr(self, name)
         return found
 
 

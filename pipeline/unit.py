@@ -30,30 +30,32 @@ class Step(NamedTuple):
 
 
 DOCUMENTS = ("calibration", "validation", "diagnosis")
-BENCH = ("sensor", "table", "procedure")
+BENCH_SECTIONS = ("sensor", "table", "procedure")
 STEPS = {  # in the order of a run
-    "ingest": Step("ingest.ingest", ("files",), (*BENCH, "ingest"), "checked"),
+    "ingest": Step("ingest.ingest", ("files",), (*BENCH_SECTIONS, "ingest"), "checked"),
     "filter": Step("filter.filter_recordings", ("checked",), ("sensor", "filter"), "recordings"),
     # once for each stage of the method of each sensor; the stage ``effects`` reads the section ``effects``, too
-    "fit": Step("fit.fit", ("recordings", "fits"), (*BENCH, "method", "uncertainty"), "fits"),
-    "validate": Step("validate.validate_unit", ("unit", "recordings", "fits"), (*BENCH, "limits"), "validated"),
+    "fit": Step("fit.fit", ("recordings", "fits"), (*BENCH_SECTIONS, "method", "uncertainty"), "fits"),
+    "validate": Step(
+        "validate.validate_unit", ("unit", "recordings", "fits"), (*BENCH_SECTIONS, "limits"), "validated"
+    ),
     "diagnose": Step(
         "diagnose.diagnose_unit",
         ("unit", "recordings", "fits", "validated"),
-        (*BENCH, "effects", "method", "diagnosis"),
+        (*BENCH_SECTIONS, "effects", "method", "diagnosis"),
         "diagnosed",
     ),
     "calibration": Step(
         "calibration.calibration_document",
         ("unit", "checked", "fits", "validated", "diagnosis"),
-        (*BENCH, "method", "ingest", "stated"),
+        (*BENCH_SECTIONS, "method", "ingest", "stated"),
         "calibration",
     ),
     "export": Step("export.export", DOCUMENTS, ("sensor", "table"), "exports"),
     "report": Step(
         "report.report",
         ("recordings", *DOCUMENTS, "omissions"),
-        (*BENCH, "method", "filter", "ingest", "effects", "limits", "certificate", "stated"),
+        (*BENCH_SECTIONS, "method", "filter", "ingest", "effects", "limits", "certificate", "stated"),
         "pages",
     ),
     "summary": Step("summary.summarise", DOCUMENTS, ("sensor", "stated"), "summary"),

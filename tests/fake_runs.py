@@ -19,10 +19,10 @@ from stage_files import write_pack
 from pipeline.config import load_campaign
 from pipeline.config.campaign import UnitRow
 from pipeline.config.owner import check_owner, claim, complete_record
-from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch
+from pipeline.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch
 from pipeline.results_folder import (
     NEW_FOLDER,
-    PUBLISHED,
+    PUBLISHED_PATHS,
     _digest,
     _record,
     finish_publishing,
@@ -97,7 +97,7 @@ def documents(unit: str, recording: str, setting: str) -> dict[str, dict[str, An
         calibration = head | {"status": "failed", "error": failure, "inputs": []}
         of_report = {f"{unit}.calibration.json": calibration, f"{unit}.html": f"failed {of}"}
         found = {f"{unit}.json": summary | {"failure": failure, "sha256": []}}
-        return dict.fromkeys(STAGES, failed) | {"report": failed | of_report, "summary": failed | found}
+        return dict.fromkeys(PACKED_STEPS, failed) | {"report": failed | of_report, "summary": failed | found}
     inputs = [{"file": f"raw/{unit}/accel_x.csv", "sha256": sha256(recording)}]
     diagnosis: dict[str, Any] = {f"{unit}.json": head}
     if setting.startswith("odd"):
@@ -132,7 +132,7 @@ def run(
     finish_publishing(results)
     batch = results / "batches" / BATCH
     made = {u: documents(u, recordings[u], settings.get(u, "none")) for u in recordings}
-    for stage in (*STAGES, WITH_PRIOR):
+    for stage in (*PACKED_STEPS, WITH_PRIOR):
         members = [each.get(stage, {}) for each in made.values()]
         (batch / f"{stage}.zip").unlink(missing_ok=True)  # as Snakemake does
         if stage != WITH_PRIOR or lot:
@@ -146,12 +146,12 @@ def _publish(results: Path, units: list[str], again: int, *, packed: bool) -> No
     finish_publishing(results)
     new, batch = results / NEW_FOLDER, Batch(results / "batches" / BATCH)
     shutil.rmtree(new, ignore_errors=True)
-    for name in PUBLISHED:
+    for name in PUBLISHED_PATHS:
         if "." not in name:
             (new / name).mkdir(parents=True)
     asked = gather.asked_units(results)
     found = {u: gather._gather_unit(batch, u, new, publish=not packed or u in asked) for u in units}
-    for stage in (*STAGES, *([WITH_PRIOR] if batch.combined else [])) if packed else ():
+    for stage in (*PACKED_STEPS, *([WITH_PRIOR] if batch.combined else [])) if packed else ():
         gather._link(results / "batches" / BATCH / f"{stage}.zip", new / PACKS / BATCH / f"{stage}.zip")
     rows = {u: found[u]["sha256"] for u in units}
     for name, text in {"summary.csv": "unit\n" + "\n".join(units), "index.html": f"campaign {rows}",
@@ -176,6 +176,6 @@ def as_of_version_1(results: Path) -> None:
     if record.is_file():
         found = json.loads(record.read_text())
         below = {name: {p[len(name) + 1 :]: s for p, s in found["written"].items() if p.partition("/")[0] == name}
-                 for name in PUBLISHED} if "written" in found else {}  # fmt: skip
+                 for name in PUBLISHED_PATHS} if "written" in found else {}  # fmt: skip
         files = found.get("files") or {name: _digest(states) for name, states in below.items()}
         record.write_text(json.dumps({"again": found["again"], "files": files}))

@@ -18,7 +18,7 @@ from pipeline.config.owner import require_own_results
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError, first
 from pipeline.files import write_atomically
 from pipeline.model.effects import catalogue
-from pipeline.outcome import NAMED_PER_LINE, RESULTS, changes_of, read_summary, run_command
+from pipeline.outcome import DEFAULT_RESULTS, NAMED_PER_LINE, changes_of, read_summary, run_command
 from pipeline.pack import read_published
 from pipeline.records import SENSORS
 from pipeline.verdicts import Verdict
@@ -123,7 +123,7 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
     if not undo and (note := _bench_note(chain.from_iterable(effects_of.values()))):
         print(note)
     settings = {"campaign": arguments.campaign, **run_settings}
-    if arguments.results != RESULTS:
+    if arguments.results != DEFAULT_RESULTS:
         settings["results"] = arguments.results
     command = run_command(settings).replace("--cores 2", f"--cores {arguments.cores}", 1)
     if arguments.no_run:

@@ -17,7 +17,7 @@ from pipeline.config.options import GROUPS, Problem, default_option, nearest, pa
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
-from pipeline.model.sensor_file import NEEDED, range_settings
+from pipeline.model.sensor_file import REQUIRED_FIGURES, range_settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -105,7 +105,7 @@ def _origins(composer: Composer, layers: Sequence[Layer]) -> dict[Key, str]:
         option = options.get(group) or default_option(group)
         for key, value in _leaves(read_option(group, option, tuple(composer.searchpath)), (group,)):
             reference = f", {value}" if isinstance(value, str) and "${" in value else ""
-            assumed = group == "sensor" and value is None and key[-1] in NEEDED
+            assumed = group == "sensor" and value is None and key[-1] in REQUIRED_FIGURES
             origins[key] = _file(composer, group, "generic" if assumed else option) + reference
         origins[group, "name"] = defaults_of.get(group, "default, configs/config.yaml")
     defaults = read_option("", "config", ())

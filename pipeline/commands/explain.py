@@ -15,7 +15,7 @@ from pipeline.diagnosis.words import in_words
 from pipeline.errors import InputError, MissingInputError
 from pipeline.exports.conversion import explain_board, explain_calibration
 from pipeline.exports.reading import counts_of, read_any
-from pipeline.files import read_json
+from pipeline.files import JSON, read_json
 from pipeline.history import read_history
 from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 from pipeline.outcome import (
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
     from pipeline.verdicts import Problem
 
-JSON = dict[str, Any]
 MOST_ROWS = 24  # of an overview: those of a terminal
 NARROWEST = 40  # columns, below which lines are not wrapped further
 UPPER_LIMITS = "Upper limits"  # the sentence of ``in_words`` that --limits adds

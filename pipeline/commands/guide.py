@@ -33,7 +33,7 @@ from pipeline.planning.guide import (
 from pipeline.records import NotCalibrated
 from pipeline.settings import RecordingFile
 from pipeline.signal.rests import WINDOW_S, find_rests
-from pipeline.simulation.description import BY_HAND
+from pipeline.simulation.description import COURSE_BY_HAND
 from pipeline.unit import Task, UnitFiles, UnitState, run_steps
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
         "--dwell",
         type=float,
         metavar="S",
-        default=BY_HAND.dwell_s,
+        default=COURSE_BY_HAND.dwell_s,
         help="planned length of a rest (default: %(default)g)",
     )
     add("--procedure", metavar="NAME", help="multi_position (default), orientations_24, six_positions or ferraris")

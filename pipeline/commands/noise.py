@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.commands import parser_of
 from pipeline.commands.readings import Reading, config_of_log
@@ -12,7 +12,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.exports import ExportedUnit, export, formats
 from pipeline.exports.sensors import SensorFigures
-from pipeline.files import json_text, write_atomically
+from pipeline.files import JSON, json_text, write_atomically
 from pipeline.records import AXES, SENSORS
 from pipeline.report.noise_section import remarks, term_rows
 from pipeline.report.numbers import MINUS, aligned, number
@@ -20,7 +20,6 @@ from pipeline.report.numbers import MINUS, aligned, number
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-JSON = dict[str, Any]
 EPILOG = """\
 The unit must rest during the whole log. The slow terms need hours; for a term that needs a longer log, an upper limit
 (<) is printed. -o writes the file of another program, chosen by its name (kalibr_imu.yaml, vins.yaml), or all results

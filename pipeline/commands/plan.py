@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-FILE = "simulation.yaml"
+DESCRIPTION_FILE = "simulation.yaml"
 EPILOG = """\
 For each effect the plan states the smallest size that the diagnosis would find in half of the units, at the noise of
 the sensor file; this size as a share of the limit in the sensor file; effects with a similar signal; and the size up
@@ -72,7 +72,13 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     words = "take sensor, table and procedure from the description of a simulation"
     add("--from", dest="source", type=Path, default=None, metavar="FILE", help=words)
-    add("--campaign", type=Path, default=None, metavar="DIR", help=f"likewise, from the description DIR/{FILE}")
+    add(
+        "--campaign",
+        type=Path,
+        default=None,
+        metavar="DIR",
+        help=f"likewise, from the description DIR/{DESCRIPTION_FILE}",
+    )
     add("--unit", default=None, metavar="NAME", help="a unit of the description (default: the first)")
     add("--effect", dest="effects", action="append", type=Path, default=[], metavar="FILE",
         help="an effect of your own (YAML); those of the campaign are always included")  # fmt: skip
@@ -105,10 +111,10 @@ def _described_unit(arguments: argparse.Namespace) -> UnitDescription | None:
     if source is not None and campaign is not None:
         raise ConfigurationError("--from and --campaign both name a description; give one of them")
     if campaign is not None:
-        source = campaign / FILE
+        source = campaign / DESCRIPTION_FILE
         if campaign.is_dir() and not source.is_file():
             raise ConfigurationError(
-                f"this campaign has no {FILE}, so its procedure is unknown; "
+                f"this campaign has no {DESCRIPTION_FILE}, so its procedure is unknown; "
                 "give its sensor, table, procedure and course as options",
                 str(campaign),
             )

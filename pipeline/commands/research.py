@@ -33,7 +33,7 @@ def study(argv: Sequence[str]) -> int:
     from pipeline.study.cases import FAMILIES  # noqa: PLC0415  (not needed for a comparison with the thesis)
     from pipeline.study.page import DIAGRAM, page  # noqa: PLC0415
     from pipeline.study.result import cases_of  # noqa: PLC0415
-    from pipeline.study.run import RESULTS, TRUTH, read_lines, run_study  # noqa: PLC0415
+    from pipeline.study.run import RESULTS_FILE, TRUTH_FILE, read_lines, run_study  # noqa: PLC0415
     from pipeline.study.scores import accepted, answer_scores, family_scores, reliability_diagram  # noqa: PLC0415
 
     parser = parser_of("study", study.__doc__, STUDY.format(", ".join(FAMILIES)))
@@ -57,7 +57,7 @@ def study(argv: Sequence[str]) -> int:
         arguments.directory, families, arguments.n, arguments.seed, processes=arguments.processes, progress=progress
     )
     countdown.end()
-    cases = cases_of(read_lines(arguments.directory / TRUTH), read_lines(arguments.directory / RESULTS))
+    cases = cases_of(read_lines(arguments.directory / TRUTH_FILE), read_lines(arguments.directory / RESULTS_FILE))
     for score in [*accepted(cases), *family_scores(cases), *answer_scores(cases)]:
         name, n, value, interval, goal = score.cells
         print(f"{name:<92} {n:>5} {value:>8} {interval:<16} {goal:<9} {' '.join(score.misses[:8])}".rstrip())
@@ -114,7 +114,7 @@ def _seeds(campaign: Path, count: int, processes: int, output: Path) -> None:
 
     import pandas as pd  # noqa: PLC0415
 
-    from pipeline.thesis.seeds import COLUMNS, sets_of, study_of  # noqa: PLC0415  (estimators: not for the page)
+    from pipeline.thesis.seeds import SEED_COLUMNS, sets_of, study_of  # noqa: PLC0415  (estimators: not for the page)
 
     rows = []
     sets = sets_of(campaign)
@@ -122,4 +122,4 @@ def _seeds(campaign: Path, count: int, processes: int, output: Path) -> None:
         for name, of_set in zip(sets, pool.map(partial(study_of, campaign, range(count)), sets), strict=True):
             rows += of_set
             print(f"{name}: {len(of_set)} rows", file=sys.stderr, flush=True)
-    pd.DataFrame(rows, columns=COLUMNS).to_csv(output, index=False, float_format="%.5g", lineterminator="\n")
+    pd.DataFrame(rows, columns=SEED_COLUMNS).to_csv(output, index=False, float_format="%.5g", lineterminator="\n")

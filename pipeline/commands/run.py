@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from pipeline.commands import add_run_options, parser_of
 from pipeline.errors import ConfigurationError
 from pipeline.files import SHIPPED
-from pipeline.outcome import RESULTS
+from pipeline.outcome import DEFAULT_RESULTS
 
 if TYPE_CHECKING:
     import argparse
@@ -57,6 +57,6 @@ def run_snakemake(arguments: argparse.Namespace, config: Sequence[str], options:
     Snakemake.
     """
     settings = [f"campaign={arguments.campaign}", *config]
-    settings += [f"results={arguments.results}"] * (arguments.results != RESULTS)
+    settings += [f"results={arguments.results}"] * (arguments.results != DEFAULT_RESULTS)
     command = [sys.executable, "-m", "snakemake", "--cores", arguments.cores, "--snakefile", str(SHIPPED / "Snakefile")]
     return subprocess.run([*command, *options, "--config", *settings], check=False).returncode  # noqa: S603  (the user's own run)

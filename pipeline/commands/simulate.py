@@ -31,7 +31,7 @@ from pipeline.simulation.description import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-FILE = "simulation.yaml"
+DESCRIPTION_FILE = "simulation.yaml"
 EPILOG = """\
 The campaign follows from a description: DIR/simulation.yaml or --from FILE. With options, or without a description, it
 follows from the options, and the command writes their description to DIR/simulation.yaml.
@@ -61,8 +61,8 @@ def main(argv: Sequence[str]) -> int:
     quiet: bool = arguments.pop("quiet")
     sheet_only: bool = arguments.pop("sheet_only")
     replace: bool = arguments.pop("replace")
-    if source is None and not arguments and (directory / FILE).is_file():
-        source = directory / FILE
+    if source is None and not arguments and (directory / DESCRIPTION_FILE).is_file():
+        source = directory / DESCRIPTION_FILE
     if source is not None and arguments:
         given = ", ".join(f"--{name.replace('_', '-')}" for name in arguments)
         raise ConfigurationError(f"--from takes everything from the description; leave out {given} or --from")
@@ -73,7 +73,7 @@ def main(argv: Sequence[str]) -> int:
         description = description_from(data, "the options")
         directory.mkdir(parents=True, exist_ok=True)
         text = "# Read by: python -m pipeline simulate\n" + yaml.safe_dump(data, sort_keys=False)
-        (directory / FILE).write_text(text, encoding="utf-8")
+        (directory / DESCRIPTION_FILE).write_text(text, encoding="utf-8")
     directory.mkdir(parents=True, exist_ok=True)
     folder = directory if source is None else source.parent
     for effect in read_effect_files(sorted((folder / "effects").glob("*.yaml"))).values():

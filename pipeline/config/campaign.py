@@ -38,7 +38,7 @@ from pipeline.config.layers import as_list, load_layers
 from pipeline.config.options import GROUPS, RUN_SETTINGS, Problem, mapping_of, nearest, parse
 from pipeline.config.user_effects import GIVEN, PYTHON
 from pipeline.errors import ConfigurationError, first
-from pipeline.files import CONFIGS, SHIPPED, canonical_json
+from pipeline.files import CONFIGS, JSON, SHIPPED, canonical_json
 from pipeline.history import SENSORS
 from pipeline.settings import OF_BENCH, RunSettings
 
@@ -48,9 +48,8 @@ if TYPE_CHECKING:
     from pipeline.config.layers import Layers
     from pipeline.settings import Settings
 
-    Rows = Mapping[str, Mapping[str, str]]  # unit to its cells by column
+    SheetRows = Mapping[str, Mapping[str, str]]  # unit to its cells by column
 
-JSON = dict[str, Any]
 TAKE_OVER = "take_over"
 SMALLEST_BATCH, LARGEST_BATCH = 25, 160  # units: a job takes some seconds, as its start does; a minute, to fill cores
 
@@ -256,9 +255,9 @@ def boards_of(units: Mapping[str, UnitRow]) -> dict[str, list[str]]:
     return {board: chips for board, chips in boards.items() if len(chips) > 1}
 
 
-KEYS = ("title", "units", "groups", "by", "where", "pairs", "against", "x", "sensors")
+COMPARISON_KEYS = ("title", "units", "groups", "by", "where", "pairs", "against", "x", "sensors")
 TABLE_TIME = "table_time"
-FORM = "a list of units, or a mapping with units, groups or by"
+COMPARISON_FORM = "a list of units, or a mapping with units, groups or by"
 
 
 def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], file: str) -> list[JSON]:
@@ -284,13 +283,13 @@ def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], fi
     return comparisons
 
 
-def _cell(rows: Rows, unit: str, column: str) -> str:
+def _cell(rows: SheetRows, unit: str, column: str) -> str:
     if column not in rows[unit]:
         raise Problem(f"units have no column {column!r}{nearest(column, rows[unit])}")
     return str(rows[unit][column])
 
 
-def _select(rows: Rows, wanted: Any, among: Sequence[str]) -> list[str]:  # noqa: ANN401  (the user's)
+def _select(rows: SheetRows, wanted: Any, among: Sequence[str]) -> list[str]:  # noqa: ANN401  (the user's)
     """Return the units of a list of names, or those whose columns have the values of a mapping."""
     if isinstance(wanted, dict):
         values = {str(c): _names(v) for c, v in wanted.items()}
@@ -304,13 +303,13 @@ def _select(rows: Rows, wanted: Any, among: Sequence[str]) -> list[str]:  # noqa
     return [str(n) for n in wanted]
 
 
-def _comparison(entry: Any, number: int, rows: Rows) -> JSON:  # noqa: ANN401  (the user's)
+def _comparison(entry: Any, number: int, rows: SheetRows) -> JSON:  # noqa: ANN401  (the user's)
     entry = {"units": entry} if isinstance(entry, list) else entry
     if not isinstance(entry, dict):
-        raise Problem(f"{FORM} is expected, got {entry!r}")
-    unknown = [str(k) for k in entry if k not in KEYS]
+        raise Problem(f"{COMPARISON_FORM} is expected, got {entry!r}")
+    unknown = [str(k) for k in entry if k not in COMPARISON_KEYS]
     if unknown:
-        raise Problem(f"{unknown[0]}: unknown key{nearest(unknown[0], KEYS)}")
+        raise Problem(f"{unknown[0]}: unknown key{nearest(unknown[0], COMPARISON_KEYS)}")
     groups = _groups(entry, rows)
     names, members = [g["name"] for g in groups], [u for g in groups for u in g["units"]]
     against = str(entry.get("against", names[0]))
@@ -329,11 +328,11 @@ def _comparison(entry: Any, number: int, rows: Rows) -> JSON:  # noqa: ANN401  (
     }
 
 
-def _groups(entry: JSON, rows: Rows) -> list[JSON]:
+def _groups(entry: JSON, rows: SheetRows) -> list[JSON]:
     """Return the groups of an entry: at least two, none empty, without common units."""
     keys = [k for k in ("units", "groups", "by") if k in entry]
     if len(keys) != 1:
-        raise Problem(f"{FORM} is expected, got {' and '.join(keys) or 'none of them'}")
+        raise Problem(f"{COMPARISON_FORM} is expected, got {' and '.join(keys) or 'none of them'}")
     among, content = _select(rows, entry.get("where") or {}, list(rows)), entry[keys[0]]
     if keys[0] == "by":
         groups = _by(_names(content), str(entry.get("x", "")), among, rows)
@@ -357,7 +356,7 @@ def _groups(entry: JSON, rows: Rows) -> list[JSON]:
     return groups
 
 
-def _by(names: list[str], x: str, among: list[str], rows: Rows) -> list[JSON]:
+def _by(names: list[str], x: str, among: list[str], rows: SheetRows) -> list[JSON]:
     """Return a group for each combination of values, in the order of the units table."""
     along = names.index(x) if x in names else len(names) - 1
     units_with: dict[tuple[str, ...], list[str]] = {}
@@ -371,7 +370,7 @@ def _by(names: list[str], x: str, among: list[str], rows: Rows) -> list[JSON]:
     ]
 
 
-def _x(column: str, members: list[str], by: list[str], rows: Rows) -> JSON:
+def _x(column: str, members: list[str], by: list[str], rows: SheetRows) -> JSON:
     if column == TABLE_TIME:
         return {"label": "table time, s", "values": None, "named": True}
     values = {}

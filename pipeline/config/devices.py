@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import yaml
 
-from pipeline.config.layers import DEVICES, key_of
+from pipeline.config.layers import DEVICES_FOLDER, key_of
 from pipeline.config.options import Problem, nearest, parse
 from pipeline.errors import ConfigurationError
 from pipeline.history import SENSORS
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pipeline.config.compose import Composer
     from pipeline.config.layers import Layer, Layers
 
-KEY = "overrides"
+OVERRIDES_KEY = "overrides"
 
 
 class Edit(NamedTuple):
@@ -61,7 +61,7 @@ def edit_effects(
     for sensor in dict.fromkeys(sensor for sensor, _ in effects):
         key = f"effects.{sensor}"
         _refuse_stronger(of_unit, key, composer.campaign, unit)
-        weaker = _value([layer for layer in of_unit if layer.origin != f"{DEVICES}/{unit}.yaml"], key)
+        weaker = _value([layer for layer in of_unit if layer.origin != f"{DEVICES_FOLDER}/{unit}.yaml"], key)
         now = _value(of_unit, key)
         wanted = list(now)
         for name in (name for s, name in effects if s == sensor):
@@ -83,7 +83,7 @@ def edit_effects(
             raise ConfigurationError(f"unit {unit}: {problem}") from None
         if wanted != now:
             text = set_override(text, key, None if wanted == weaker else override, str(file))
-    empty = all(line.strip() in ("", f"{KEY}:", f"{KEY}: []") for line in text.splitlines())
+    empty = all(line.strip() in ("", f"{OVERRIDES_KEY}:", f"{OVERRIDES_KEY}: []") for line in text.splitlines())
     return Edit(file, None if empty else text, changes)
 
 
@@ -94,9 +94,9 @@ def _file(unit: str, layers: Layers, directory: Path) -> Path:
         raise ConfigurationError(f"no unit {unit!r}{nearest(unit, rows)}", units_table)
     others = [u for u, row in rows.items() if row.get("serial") == unit and u != unit]
     if others:
-        both = f"{DEVICES}/{unit}.yaml would concern {', '.join(others)} too, whose serial is {unit}"
+        both = f"{DEVICES_FOLDER}/{unit}.yaml would concern {', '.join(others)} too, whose serial is {unit}"
         raise ConfigurationError(f"{both}: give the unit or the serial another name", units_table)
-    return directory / DEVICES / f"{unit}.yaml"
+    return directory / DEVICES_FOLDER / f"{unit}.yaml"
 
 
 def set_override(text: str, key: str, override: str | None, file: str) -> str:
@@ -112,7 +112,7 @@ def set_override(text: str, key: str, override: str | None, file: str) -> str:
         correct = False
     if not correct:
         what = f"remove {key}" if override is None else f"write {override!r}"
-        raise ConfigurationError(f"cannot be edited in place: {what} yourself, in its list '{KEY}'", file)
+        raise ConfigurationError(f"cannot be edited in place: {what} yourself, in its list '{OVERRIDES_KEY}'", file)
     return edited
 
 
@@ -128,11 +128,11 @@ def _edited(text: str, key: str, override: str | None) -> str:
     """Return the text with the entry changed in place, or the same text if a comment would be lost."""
     root = yaml.compose(text, yaml.SafeLoader)
     pairs = root.value if isinstance(root, yaml.MappingNode) else []
-    node = next((value for name, value in pairs if name.value == KEY), None)
+    node = next((value for name, value in pairs if name.value == OVERRIDES_KEY), None)
     written = None if override is None else json.dumps(override, ensure_ascii=False)
     if node is None:
         end = "" if not text or text.endswith("\n") else "\n"
-        return f"{text}{end}{KEY}:\n  - {written}\n"
+        return f"{text}{end}{OVERRIDES_KEY}:\n  - {written}\n"
     if isinstance(node, yaml.SequenceNode) and not node.flow_style:
         return _edited_lines(text, node.value, key, written)
     start, stop = node.start_mark.index, node.end_mark.index
@@ -168,7 +168,7 @@ def _overrides(text: str) -> list[str]:
     content = yaml.safe_load(text) or {}
     if not isinstance(content, dict):
         raise ConfigurationError("a mapping is expected")
-    entries = content.get(KEY) or []
+    entries = content.get(OVERRIDES_KEY) or []
     return [entries] if isinstance(entries, str) else list(entries)
 
 
@@ -180,14 +180,14 @@ def _refuse_stronger(layers: Sequence[Layer], key: str, directory: Path, unit: s
         if origin.startswith("units.csv line"):
             line = origin.removeprefix("units.csv line ").split(",")[0]
             raise ConfigurationError(
-                f"the column overrides sets {text} for unit {unit}, which is stronger than {DEVICES}/{unit}.yaml: "
-                "edit this cell, or clear it",
+                f"the column overrides sets {text} for unit {unit}, which is stronger than "
+                f"{DEVICES_FOLDER}/{unit}.yaml: edit this cell, or clear it",
                 f"{directory / 'units.csv'}:{line}",
             )
         if origin.startswith("command line"):
             raise ConfigurationError(
-                f"--config {origin.removeprefix('command line, ')}{text} is stronger than {DEVICES}/{unit}.yaml for "
-                f"unit {unit}: leave it out"
+                f"--config {origin.removeprefix('command line, ')}{text} is stronger than "
+                f"{DEVICES_FOLDER}/{unit}.yaml for unit {unit}: leave it out"
             )
 
 

@@ -133,7 +133,7 @@ def _misspelt(columns: list[str]) -> list[str]:
     return problems
 
 
-DEVICES = "devices"
+DEVICES_FOLDER = "devices"
 BETWEEN_OVERRIDES = re.compile(r';(?=(?:[^"]*"[^"]*")*[^"]*$)')  # a semicolon outside double quotes
 SIMULATION = "simulation.yaml"
 LIST = "a list of overrides KEY=VALUE"
@@ -198,7 +198,7 @@ class Layers:
         origins: dict[str, Sequence[str]] = {
             "campaign.yaml": self.campaign.overrides,
             f"campaign.yaml, lots, {lot}": self.campaign.lots.get(lot, ()),
-            **{f"{DEVICES}/{name}.yaml": self.devices.get(name, ()) for name in (row.get("serial", ""), unit)},
+            **{f"{DEVICES_FOLDER}/{name}.yaml": self.devices.get(name, ()) for name in (row.get("serial", ""), unit)},
             **{f"{line}, column {g}": [f"{g}={row[g]}"] for g in GROUPS if row.get(g)},
             f"{line}, column overrides": of_row,
             "command line, overrides=": self.command,
@@ -292,7 +292,7 @@ def _read_devices(directory: Path, units_table: UnitsTable) -> dict[str, list[st
     """Read ``devices/*.yaml``: serial or unit to overrides; one ``ConfigurationError`` names all invalid files."""
     known = set(units_table.rows) | {row["serial"] for row in units_table.rows.values() if row.get("serial")}
     devices, problems = {}, []
-    for file in sorted((directory / DEVICES).glob("*.yaml")):
+    for file in sorted((directory / DEVICES_FOLDER).glob("*.yaml")):
         if file.stem not in known:
             problems.append(f"{file}: no unit or serial {file.stem!r} in units.csv{nearest(file.stem, known)}")
             continue

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 RUN_SETTINGS = tuple(RunSettings.model_fields)
 LARGEST_CONFIG = 10_000  # values of an option; the largest in configs/ has 160
-NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
-TOKEN = re.compile(r"(\\\$\{)|\$\{\s*([A-Za-z_]\w*(?:\.\w+)+)\s*\}|\$\{")
+NUMBER_OVERRIDE = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
+REFERENCE_TOKEN = re.compile(r"(\\\$\{)|\$\{\s*([A-Za-z_]\w*(?:\.\w+)+)\s*\}|\$\{")
 MAX_REFERENCE_LENGTH = 10_000  # characters of a value with references, such as a name or a unit
-FORM = "a reference is ${group.key}, for example ${sensor.accelerometer.counts_per_unit}"
+REFERENCE_FORM = "a reference is ${group.key}, for example ${sensor.accelerometer.counts_per_unit}"
 
 
 class Problem(Exception):  # noqa: N818  (problems are collected, then raised as one ConfigurationError)
@@ -53,7 +53,7 @@ def parse(text: str) -> tuple[str, Any]:
     A plain number, the usual override of a single unit, is read without Hydra's parser, which takes 0.6 ms. Raises
     ``Problem`` if the text is not an override, or is a sweep or a deletion.
     """
-    number = NUMBER.fullmatch(text)
+    number = NUMBER_OVERRIDE.fullmatch(text)
     if number:
         key, value, fraction = number.groups()
         return key, float(value) if fraction else int(value)
@@ -112,8 +112,10 @@ def check_references(value: Any, where: str | None = None) -> None:  # noqa: ANN
     elif isinstance(value, list):
         for below in value:
             check_references(below, where)
-    elif isinstance(value, str) and any(not escaped and not name for escaped, name in TOKEN.findall(value)):
-        raise ConfigurationError(f"{value[:200]!r}: {FORM}; resolvers such as ${{oc.env:NAME}} are not read", where)
+    elif isinstance(value, str) and any(not escaped and not name for escaped, name in REFERENCE_TOKEN.findall(value)):
+        raise ConfigurationError(
+            f"{value[:200]!r}: {REFERENCE_FORM}; resolvers such as ${{oc.env:NAME}} are not read", where
+        )
 
 
 def with_references(node: Any, root: dict[str, Any]) -> Any:  # noqa: ANN401  (dict, list or value)
@@ -128,11 +130,11 @@ def with_references(node: Any, root: dict[str, Any]) -> Any:  # noqa: ANN401  (d
     if not isinstance(node, str) or "${" not in node:
         return node
     check_references(node)
-    whole = TOKEN.fullmatch(node)
+    whole = REFERENCE_TOKEN.fullmatch(node)
     if whole and whole.group(2):
         return _value_of(whole.group(2), root, node)
     text, end = "", 0
-    for token in TOKEN.finditer(node):
+    for token in REFERENCE_TOKEN.finditer(node):
         value = None if token.group(1) else _value_of(token.group(2), root, node)
         if not token.group(1) and value is None:
             raise ConfigurationError(f"{node[:200]!r}: {token.group(2)} is null; set it")

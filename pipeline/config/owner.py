@@ -27,8 +27,8 @@ from pipeline.results_folder import (
     BESIDE,
     NEW_FOLDER,
     OPEN_LOCKS,
-    OWNER,
-    PUBLISHED,
+    OWNER_FILE,
+    PUBLISHED_PATHS,
     REPLACED,
     ResultsOwner,
     finish_publishing,
@@ -208,7 +208,9 @@ def _move_all(campaign: Campaign) -> Path | None:
         if is_owner(results, campaign.directory):  # another process has moved them
             return None
         finish_publishing(results)
-        names = [name for name in (*PUBLISHED, *BESIDE, NEW_FOLDER, OWNER) if os.path.lexists(results / name)]
+        names = [
+            name for name in (*PUBLISHED_PATHS, *BESIDE, NEW_FOLDER, OWNER_FILE) if os.path.lexists(results / name)
+        ]
         return set_aside({name: results / name for name in names}, results)
     finally:
         OPEN_LOCKS.pop().close()

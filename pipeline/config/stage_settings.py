@@ -29,21 +29,21 @@ if TYPE_CHECKING:
 PACKAGE = Path(__file__).resolve().parents[1]
 PACKAGES = ("pipeline", "imu_logs")  # beside each other, in a clone and in a wheel
 CAMPAIGN = "campaign"  # cannot be a batch, because their names end in a number
-EFFECTS = CONFIGS / "effect"  # read by pipeline.model.effects
+EFFECTS_FOLDER = CONFIGS / "effect"  # read by pipeline.model.effects
 # An import of the package, or of jinja2: module and names, or only a module. ``ast`` takes 0.5 s for all files.
 IMPORT = re.compile(
     r"^[ \t]*(?:from (pipeline[\w.]*|jinja2) import (\([^)]*\)|.*)|import (pipeline[\w.]*))", re.MULTILINE
 )
-OF_STAGES = {**{name: step.settings for name, step in STEPS.items()}, "prior": STEPS["validate"].settings}
+SECTIONS_OF_STAGES = {**{name: step.settings for name, step in STEPS.items()}, "prior": STEPS["validate"].settings}
 
 
 def sections_of(stage: str, sensor: str, settings: Settings) -> tuple[str, ...]:
-    """Return the sections that a stage reads: a key of ``OF_STAGES``, or the stage ``effects`` of a sensor's fit."""
+    """Return the sections that a stage reads: a key of ``SECTIONS_OF_STAGES``, or ``effects`` of a sensor's fit."""
     if stage != "effects":
-        return OF_STAGES[stage]
+        return SECTIONS_OF_STAGES[stage]
     mounted = settings.table.seat_deg is not None or "mounting" in settings.effects.gyroscope
     both = sensor == "gyroscope" and mounted  # gravity determines the mounting of the unit in each recording
-    return (*OF_STAGES["fit"], f"effects.{sensor}", *(["effects.accelerometer"] if both else []))
+    return (*SECTIONS_OF_STAGES["fit"], f"effects.{sensor}", *(["effects.accelerometer"] if both else []))
 
 
 def settings_of_unit(unit: UnitRow, stage: str, sensor: str, stated: Stated) -> dict[str, Any]:
@@ -101,7 +101,7 @@ def settings_of_jobs(
         rows = [campaign.units[unit] for unit in units]
         fits = [(s, stage) for s in SENSORS for stage in campaign.chains[batch][s]]
         outputs = {f"fit/{s}/{stage}": (stage if stage == "effects" else "fit", s) for s, stage in fits}
-        outputs |= {stage: (stage, "") for stage in OF_STAGES if stage not in ("fit", "prior")}
+        outputs |= {stage: (stage, "") for stage in SECTIONS_OF_STAGES if stage not in ("fit", "prior")}
         outputs |= {"prior": ("prior", "")} if campaign.combine == "lot" else {}
         files[batch] = {
             output: _file(output, _content(campaign, rows, *stage, summaries), again(f"batches/{batch}/{output}.zip"))
@@ -244,7 +244,7 @@ def _imports(file: Path) -> tuple[Path, ...]:
     if file.name == "__init__.py" and b"import_module(" in source:
         files += [f for f in file.parent.rglob("*") if f.is_file() and f.suffix != ".pyc"]
     if file == PACKAGE / "model" / "effects" / "__init__.py":
-        files += [f for f in sorted(EFFECTS.glob("*.yaml")) if b"\nbuilt_in: true" in f.read_bytes()]
+        files += [f for f in sorted(EFFECTS_FOLDER.glob("*.yaml")) if b"\nbuilt_in: true" in f.read_bytes()]
     for module, names, whole in IMPORT.findall(source.decode()):
         if module == "jinja2":
             files += (file.parent / "templates").glob("*")

@@ -13,11 +13,18 @@ import numpy as np
 
 from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.findings import DiagnosisInput, Findings, diagnosis_of
-from pipeline.diagnosis.verdict import EXPLAINED, MAX_UNKNOWN_PROBABILITY, HeldOut, VerdictInput, judged, may_be_unknown
+from pipeline.diagnosis.verdict import (
+    EXPLAINED,
+    MAX_UNKNOWN_PROBABILITY,
+    HeldOutError,
+    VerdictInput,
+    judged,
+    may_be_unknown,
+)
 from pipeline.errors import ConvergenceError, NotObservableError
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
-from pipeline.estimation.free_curves import OTHER
+from pipeline.estimation.free_curves import OTHER_PREFIX
 from pipeline.estimation.noise import with_noises
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.stages import last_fit
@@ -38,7 +45,12 @@ if TYPE_CHECKING:
 # an accelerometer whose mountings may be wrong
 IN_DOUBT = Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED
 LEANING = ("mounting", "table_axis_nonorthogonality")  # effects that tilt a turn axis in the body
-COMPARED = ("bias", "scale_factor", "non_orthogonality", "rotation")  # errors of a method that its uncertainty excludes
+ERRORS_OUTSIDE_UNCERTAINTY = (
+    "bias",
+    "scale_factor",
+    "non_orthogonality",
+    "rotation",
+)  # errors of a method that its uncertainty excludes
 
 
 def diagnose(
@@ -98,12 +110,12 @@ def diagnose(
     return diagnosis
 
 
-def held_out_of(validation: SensorValidation) -> HeldOut | None:
+def held_out_of(validation: SensorValidation) -> HeldOutError | None:
     """Return the last error of a sensor's validation; None without held-out motion or without an interval."""
     error = validation.steps[-1].rms_error
     if not validation.held_out or validation.expected_rms_error is None or error is None:
         return None
-    return HeldOut(error, *validation.expected_rms_error)
+    return HeldOutError(error, *validation.expected_rms_error)
 
 
 def doubts_of(sensor: str, recordings: Sequence[Recording], *, seats: bool = True) -> list[str]:
@@ -127,7 +139,7 @@ def evidence_of(
     sensor, recordings, settings = case.sensor, case.recordings, case.settings
     free, full = (findings.free, findings.full) if findings else (None, None)
 
-    def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOut | None:
+    def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOutError | None:
         if fit is None or case.noise is None or findings is None:
             return None
         try:
@@ -135,7 +147,7 @@ def evidence_of(
             error = last_error(held_out, held_out.held_out_samples(smoothed=smoothed))
         except ConvergenceError:  # the fit's effects cannot be subtracted from the held-out readings
             return None
-        return None if error is None else HeldOut(error[0], *error[1])
+        return None if error is None else HeldOutError(error[0], *error[1])
 
     static = None
     if case.noise is not None:
@@ -150,7 +162,7 @@ def evidence_of(
         found.residual_over_noise,
         findings.left_over_noise if findings else None,
         published=published,
-        static=HeldOut(static[0], *static[1]) if static else None,
+        static=HeldOutError(static[0], *static[1]) if static else None,
         agreement=validation.agreement if validation else None,
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,
@@ -158,12 +170,12 @@ def evidence_of(
             *doubts_of(sensor, recordings, seats=not _seats_explained(found, sensor, findings)),
             *(findings.departures if findings else ()),
         ],
-        approximations=[error.name for error in found.method_errors if error.name in COMPARED],
+        approximations=[error.name for error in found.method_errors if error.name in ERRORS_OUTSIDE_UNCERTAINTY],
         unknown=[entry.covariate for entry in found.unexplained if not entry.explained_by],
         beyond=[
-            name.removeprefix(OTHER)
+            name.removeprefix(OTHER_PREFIX)
             for name, probability in found.probability.items()
-            if name.startswith(OTHER) and probability > MAX_UNKNOWN_PROBABILITY
+            if name.startswith(OTHER_PREFIX) and probability > MAX_UNKNOWN_PROBABILITY
         ],
         implausible=() if accepted else [entry.effect for entry in found.chosen if not entry.plausible],
         held_out=found.on_table.held_out if found.on_table else None,

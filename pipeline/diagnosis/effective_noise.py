@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pipeline.settings import Table
 
 
-AVERAGING_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position
+AVERAGING_TIMES_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position
 MIN_STRETCHES = 8  # stretches, which determine a standard deviation to a quarter
 
 
@@ -61,7 +61,7 @@ def effective_noise(
     interval = errors[0][0].interval
     white = float(np.sqrt(np.mean(noise.white**2) * interval))
     densities = []
-    for time in dict.fromkeys(max(1, round(t / interval)) * interval for t in AVERAGING_S):  # whole samples
+    for time in dict.fromkeys(max(1, round(t / interval)) * interval for t in AVERAGING_TIMES_S):  # whole samples
         density = _density([error for _, error in errors], time)
         if density is None:
             continue

@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.diagnosis.verdict import if_observable
 from pipeline.diagnosis.words import experiment_of, listed, of_unknown, plain, to_distinguish
 from pipeline.estimation.design import EffectColumns, placed
-from pipeline.estimation.free_curves import OTHER
+from pipeline.estimation.free_curves import OTHER_PREFIX
 from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
@@ -170,7 +170,7 @@ def _upper_limits(findings: Findings) -> dict[str, dict[str, tuple[float, str]]]
     """Return the upper limits of the parameters of effects that were not selected, with their units."""
     limits = {}
     for name, values in findings.answers.upper_limit.items():
-        if name in findings.selected or name.startswith(OTHER):
+        if name in findings.selected or name.startswith(OTHER_PREFIX):
             continue
         this = effect(name).of_recordings(findings.turns)
         linear = [p for p in this.parameters(findings.sensor) if p.name not in this.nonlinear or this.moves]

@@ -41,9 +41,14 @@ CONSTANTS = tuple(
 FINER = 4  # places or constants to each side of the best one in each finer scan
 SOFT_STEP_WIDTHS = (0.5, 1.0, 2.0)  # of a soft step in a finer scan, over that of the scan before
 SAME_SPEED = 0.02  # relative difference of values that are one speed of the procedure
-UNITS = {"temperature": "degC", "time": "s", "speed": "deg/s", "angle": "deg"} | {f"f{a}": "g" for a in "xyz"}
+SIGNAL_UNITS = {"temperature": "degC", "time": "s", "speed": "deg/s", "angle": "deg"} | {f"f{a}": "g" for a in "xyz"}
 ORIGIN = "(temperature - 25)"  # data sheets and the catalogue also state powers of the temperature above 25 degC
-NAMES = {"u": "the axis' own signal", "speed": "the speed", "time": "the time", ORIGIN: "the temperature above 25 degC"}
+SIGNAL_WORDS = {
+    "u": "the axis' own signal",
+    "speed": "the speed",
+    "time": "the time",
+    ORIGIN: "the temperature above 25 degC",
+}
 
 
 def columns_of(formulas: Iterable[str], sensor: str) -> Curves:
@@ -205,7 +210,7 @@ class Form:
         """Return the unit of a coefficient: that of the sensor over that of the form."""
         exponents = Counter({unit_of(sensor): 1})
         for factor in filter(None, (self.factor, self.modulator)):
-            exponents[UNITS.get(factor.signal, unit_of(sensor))] -= factor.power
+            exponents[SIGNAL_UNITS.get(factor.signal, unit_of(sensor))] -= factor.power
         above = unit_of(sensor) if exponents[unit_of(sensor)] == 1 else "1"
         below = [(f"({u})" if "/" in u else u) + (f"^{-e}" if e < -1 else "") for u, e in exponents.items() if e < 0]
         return "/".join([above, *below])
@@ -249,7 +254,7 @@ def harmonic(n: int) -> Factor:
 
 def step(span: Span, place: float, width: float | None = None) -> Factor:
     """Return a step at a place, sharp or over a width."""
-    signal, unit, digits = span.signal, UNITS[span.signal], 0 if span.signal == "time" else 1
+    signal, unit, digits = span.signal, SIGNAL_UNITS[span.signal], 0 if span.signal == "time" else 1
     words = f"a step at {place:.{digits}f} {unit}"
     if width is None:
         return Factor("step", signal, (f"step({signal} - {place:.7g})",), words, constants=(place,))
@@ -264,7 +269,7 @@ def exponential(span: Span, constant: float, *, growth: bool) -> Factor:
     text = f"({signal} - {span.rounded(span.high):g})" if growth else f"({span.rounded(span.low):g} - {signal})"
     words = f"an exponential of the {signal} that {'grows' if growth else 'decays'} with a constant of {s:.3g} "
     kind = "growth" if growth else "exponential"
-    return Factor(kind, signal, (f"exp({text} / {s:g})",), words + UNITS[signal], constants=(s,))
+    return Factor(kind, signal, (f"exp({text} / {s:g})",), words + SIGNAL_UNITS[signal], constants=(s,))
 
 
 def bands(span: Span) -> list[Factor]:
@@ -272,7 +277,7 @@ def bands(span: Span) -> list[Factor]:
     found = []
     for low, high in combinations(span.places().tolist(), 2):
         text = f"band({span.signal}, {low:.5g}, {high:.5g})"
-        words = f"a band from {low:.3g} to {high:.3g} {UNITS[span.signal]}"
+        words = f"a band from {low:.3g} to {high:.3g} {SIGNAL_UNITS[span.signal]}"
         found.append(Factor("band", span.signal, (text,), words, constants=(low, high)))
     return found
 
@@ -289,7 +294,7 @@ def powers(span: Span, name: str) -> tuple[str, ...]:
 
 def polynomial(signal: str, formulas: tuple[str, ...], order: int) -> Factor:
     """Return the sum of some powers of a signal."""
-    words = f"a polynomial of order {order} in {NAMES.get(signal, signal)}"
+    words = f"a polynomial of order {order} in {SIGNAL_WORDS.get(signal, signal)}"
     return Factor("polynomial", signal, formulas, words, 1 + len(formulas))
 
 
@@ -333,7 +338,7 @@ def described(form: Form, sizes: Values, axes: Sequence[int], sensor: str) -> st
     phrase = form.factor.words
     if form.modulator:
         text = form.modulator.texts[0]
-        phrase += f" in proportion to {'the rate' if form.kind == 'ripple' else NAMES.get(text, text)}"
+        phrase += f" in proportion to {'the rate' if form.kind == 'ripple' else SIGNAL_WORDS.get(text, text)}"
     if form.factor.kind == "harmonic":
         return f"{phrase}, amplitude {size}"
     return f"{phrase}, of {size}" if form.is_height else f"{phrase}, {size} in all"

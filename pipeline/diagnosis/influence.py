@@ -12,7 +12,7 @@ uncertainties (Cook, Technometrics 19, 1977).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.observations import Observations
     from pipeline.estimation.selection import Selection
+    from pipeline.files import JSON
     from pipeline.records import Index, Values
 
-    JSON = dict[str, Any]
 
 MOST_OF = 0.5  # share of the gain that the listed seconds have together
 MAX_INFLUENTIAL_STRETCHES = 5

@@ -52,7 +52,11 @@ STEP_POSITIONS = 16  # of steps: the nearest one is within 1/32 of the span
 # of the gain by effects of time or temperature: less may be the error of a smoothed temperature
 MAX_SHARE_OF_LINEARISATION = 0.05
 RESIDUAL_OVER_NOISE = 1.1  # times the white noise: a larger residual may contain a step
-SIGNALS = {"time": "time", "temperature": "temperature", "rate": "speed"}  # of covariates, for steps and polynomials
+SIGNAL_OF_COVARIATE = {
+    "time": "time",
+    "temperature": "temperature",
+    "rate": "speed",
+}  # of covariates, for steps and polynomials
 SIMULATIONS = 199  # standard error of the share: 3.5 % at most
 
 
@@ -118,7 +122,7 @@ def _tests_of_steps(selection: Selection, covariates: Sequence[str], scan: Scan)
     observations = selection.observations
     names: list[str] = []
     scanned: list[tuple[str, Values]] = []
-    for covariate, signal in SIGNALS.items():
+    for covariate, signal in SIGNAL_OF_COVARIATE.items():
         if covariate in covariates:
             places = Span.of(observations, signal).places()
             every = max(1, len(places) // STEP_POSITIONS)
@@ -214,7 +218,7 @@ def _bases_of(selection: Selection) -> list[Basis]:
     components: list[Block] = [(range(3 * i, 3 * i + 3), 3) for i in range(3)]
     bases: list[Basis] = [("specific_force", _force, [*components, (range(9), 9)])]
     available = available_signals(observations)
-    for covariate, signal in SIGNALS.items():
+    for covariate, signal in SIGNAL_OF_COVARIATE.items():
         if signal in available:
             bases.append((covariate, _chebyshev(Span.of(observations, signal)), [(range(CURVE_DEGREE), 2)]))
     if any(part.motion.axis is not None for part in observations.parts):

@@ -17,7 +17,7 @@ Source: R. D. Cook and S. Weisberg, Residuals and Influence in Regression, 1982,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.estimation.selection import Selection
+    from pipeline.files import JSON
     from pipeline.records import Dependence, Index, Noise, Values
 
-    JSON = dict[str, Any]
 
 OWN_BASE_COLUMNS = 4  # columns of the base on each axis
 RANK_OF_RESTS = 1e-8  # of singular values: columns that are the same to rounding

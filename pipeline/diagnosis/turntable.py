@@ -28,7 +28,7 @@ from pipeline.estimation.observations import observe
 from pipeline.estimation.posterior_turns import posterior
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.model.effects import catalogue, effect
-from pipeline.records import HeldOutErrors, Noise, SensorCalibration, TableEvidence
+from pipeline.records import Noise, SelectionErrors, SensorCalibration, TableEvidence
 from pipeline.validation.error_breakdown import with_known_effects
 from pipeline.validation.heldout import noise_floors
 from pipeline.validation.samples import samples_of_motion
@@ -86,7 +86,7 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     errors, floor = _held_out_errors(reported, fits, case)
     held_out = None
     if errors and noise is not None:
-        held_out = HeldOutErrors(errors[0], errors[-1], floor)
+        held_out = SelectionErrors(errors[0], errors[-1], floor)
     hidden = not_observable(reported, case.modelled)
     squares = [fit.residual_rms**2 for fit in fits]
     reference = observations.less_stop_errors.expected_square

@@ -17,7 +17,7 @@ from pipeline.verdicts import Verdict
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.records import Agreement, Dependence, HeldOutErrors, SensorDiagnosis
+    from pipeline.records import Agreement, Dependence, SelectionErrors, SensorDiagnosis
 
 EXPLAINED = 1.5  # times the noise: largest residual that is noise; it was 0.92 to 1.14 in 140 sensors without an effect
 # least share of the residual's excess that selected effects explain if the residual has another cause too
@@ -41,7 +41,7 @@ SAME_SESSION = "record static in the session of the other recordings, without sw
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutError:
     """A held-out rms error and the interval in which it is expected, g or deg/s."""
 
     error: float
@@ -68,18 +68,20 @@ class VerdictInput:
     selected: Sequence[str] = ()
     over_noise: float | None = None  # residual over the noise, of the fit without the selected effects
     left_over_noise: float | None = None  # the same with them
-    published: HeldOut | None = None  # of the unit's calibration
+    published: HeldOutError | None = None  # of the unit's calibration
     moves: tuple[float, float] | None = None  # rms error of held-out moves and its largest expected value, deg
-    free: HeldOut | None = None  # of a free fit of the same recordings; filtered ones against the filtered reference
-    full: HeldOut | None = None  # of the free fit with the selected effects
+    free: HeldOutError | None = (
+        None  # of a free fit of the same recordings; filtered ones against the filtered reference
+    )
+    full: HeldOutError | None = None  # of the free fit with the selected effects
     agreement: Agreement | None = None
-    static: HeldOut | None = None  # mean of the static recording, by the unit's calibration
+    static: HeldOutError | None = None  # mean of the static recording, by the unit's calibration
     doubts: Sequence[str] = ()  # contradictions of the reference, from the checks of the recordings
     approximations: Sequence[str] = ()  # errors of the method's bias and matrix (``pipeline.diagnosis.method_errors``)
     unknown: Sequence[str] = ()  # covariates on which the residual with the selected effects depends
     beyond: Sequence[str] = ()  # covariates of physics that is likely and outside the catalogue
     implausible: Sequence[str] = ()  # selected effects beyond the sensor's limits, unless the settings accept that
-    held_out: HeldOutErrors | None = None  # of the selection's own fits
+    held_out: SelectionErrors | None = None  # of the selection's own fits
     method: str = ""
     fit: FitStage = field(default_factory=FitStage)  # last stage of the method
     as_printed: bool = False  # whether the method uses the equations of the thesis as printed
@@ -171,7 +173,7 @@ def verdict_of_selection(
     gain: float,
     *,
     above_noise: bool,
-    held_out: HeldOutErrors | None,
+    held_out: SelectionErrors | None,
     beyond: float = 0.0,
 ) -> Verdict:
     """Return the verdict by the selection on a table alone.
@@ -212,7 +214,7 @@ def if_observable(verdict: Verdict, ranking: Sequence[object], hidden: Mapping[s
     return Verdict.NOT_ENOUGH_DATA if shows_nothing else verdict
 
 
-def _made_worse(held_out: HeldOutErrors | None) -> bool:
+def _made_worse(held_out: SelectionErrors | None) -> bool:
     """Return whether the selected effects raise the held-out error: then they are not what is missing."""
     if held_out is None:
         return False

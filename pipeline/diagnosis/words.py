@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, FileSystemLoader, Template
 
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed
-from pipeline.estimation.free_curves import OTHER
+from pipeline.estimation.free_curves import OTHER_PREFIX
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, unit_of
 from pipeline.records import Answer
@@ -104,7 +104,9 @@ def listed(words: Sequence[str], conjunction: str = "and") -> str:
 def _said(answer: Answer) -> str:
     """Return an answer of an answer set in words, with its probability."""
     names = [
-        f"something else that follows the {name.removeprefix(OTHER)}" if name.startswith(OTHER) else plain(name)
+        f"something else that follows the {name.removeprefix(OTHER_PREFIX)}"
+        if name.startswith(OTHER_PREFIX)
+        else plain(name)
         for name in answer.effects
     ]
     return f"{' + '.join(names) or 'nothing'} ({answer.probability:.2g})"
@@ -117,9 +119,9 @@ def to_distinguish(sets: Sequence[Answer], sensor: str, *, on_table: bool) -> st
     first, second = (each.effects for each in sets[:2])
     answers = " from ".join(map(_said, sets[:2]))
     different = [name for name in first if name not in second] or [name for name in second if name not in first]
-    if different[0].startswith(OTHER):
+    if different[0].startswith(OTHER_PREFIX):
         measured = "specific_force" if sensor == "accelerometer" else "rate"
-        return f"{answers}: {UNKNOWN[different[0].removeprefix(OTHER).replace('input', measured)]}"
+        return f"{answers}: {UNKNOWN[different[0].removeprefix(OTHER_PREFIX).replace('input', measured)]}"
     return f"{answers}: {experiment_of(different[0], on_table=on_table)}"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.design import EffectColumns, NormalPrior
-from pipeline.estimation.free_curves import BEND_SHARE, Bend
+from pipeline.estimation.free_curves import MAX_BEND_SHARE_OF_ROOM, Bend
 from pipeline.model.effects import catalogue, effect, stated_priors
 from pipeline.model.effects.base import parameter_limits
 from pipeline.model.effects.mounting import SETUP_EFFECTS
@@ -229,7 +229,7 @@ def time_constants(
     """
     starts = this.starts(sensor)
     if isinstance(this, Bend):
-        log_share = float(np.log(BEND_SHARE / len(this.forms)))
+        log_share = float(np.log(MAX_BEND_SHARE_OF_ROOM / len(this.forms)))
         return [(EffectColumns(Bend(this.forms, k), starts[0]), log_share) for k in range(len(this.forms))]
     if not this.nonlinear or this.moves:
         return [(fitted or EffectColumns(this, np.zeros(len(starts[0]))), 0.0)]

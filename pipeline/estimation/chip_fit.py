@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from pipeline.settings import Sensor
 
-Signals: TypeAlias = "dict[str, Values]"
+ChannelValues: TypeAlias = "dict[str, Values]"
 
 ROW_S = 0.1  # rows: short against moves by hand, of seconds; longer ones lose angular acceleration
 LEAST_S = 10.0  # that two chips have in common: twelve blocks of a second separate five columns from noise
@@ -67,10 +67,10 @@ class Shared:
     held_out: bool
     interval: float
     time: tuple[Values, Values]
-    truth: tuple[Signals, Signals]
+    truth: tuple[ChannelValues, ChannelValues]
     valid: tuple[Mask, Mask]
 
-    def rows(self, offsets: Mapping[str, float]) -> tuple[Signals, Signals] | None:
+    def rows(self, offsets: Mapping[str, float]) -> tuple[ChannelValues, ChannelValues] | None:
         """Return the rows by each chip, the second one's stamps moved by its offsets, s; None: there are none."""
         (time, other_time), (one, two), valid = self.time, self.truth, self.valid[0]
         if any(offsets.values()) or not np.array_equal(time, other_time):
@@ -108,7 +108,7 @@ def shared(reference: Chip, other: Chip, sensors: Sequence[str]) -> list[Shared]
     return found
 
 
-def _truth(chip: Chip, recording: Recording, sensors: Sequence[str]) -> tuple[Signals, Mask]:
+def _truth(chip: Chip, recording: Recording, sensors: Sequence[str]) -> tuple[ChannelValues, Mask]:
     """Return the calibrated readings of a chip, and which samples are valid."""
     readings = {s: np.asarray(recording.reading(s)) for s in sensors}
     valid = recording.valid & np.all([np.isfinite(v).all(axis=1) for v in readings.values()], axis=0)
@@ -132,7 +132,7 @@ def _followed(rate: Values) -> Mask:
     return np.asarray(spread < 0.5)
 
 
-def _means(time: Values, signals: Mapping[str, Values], valid: Mask, interval: float) -> Signals:
+def _means(time: Values, signals: Mapping[str, Values], valid: Mask, interval: float) -> ChannelValues:
     """Return the rows of one chip: time, f, w, their derivatives, and the mean of omega omega^T (n, 3, 3)."""
     k = max(round(ROW_S / interval), 1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], valid, [False]]).astype(int)))
@@ -157,7 +157,7 @@ def _means(time: Values, signals: Mapping[str, Values], valid: Mask, interval: f
     return {name: np.concatenate(parts) for name, parts in rows.items()} or {"time": np.zeros(0)}
 
 
-def clear_of(a: Signals, b: Signals, R: Values) -> Signals:
+def clear_of(a: ChannelValues, b: ChannelValues, R: Values) -> ChannelValues:
     """Return where components exceed their noise, as 0 and 1; rows of noise alone are not used.
 
     For the specific force the deviation from its mean is used, because a bias cannot be distinguished from the mean.
@@ -182,7 +182,7 @@ def lever(turn: Values, alpha: Values) -> Values:
     return np.asarray((square + skew(np.radians(alpha))) / STANDARD_GRAVITY)
 
 
-def columns_of(sensor: str, x: Signals) -> list[tuple[str, Values]]:
+def columns_of(sensor: str, x: ChannelValues) -> list[tuple[str, Values]]:
     """Return the columns of a sensor's fit from the signals of one chip: kind and (n, 3, p) array."""
     columns = [("rotation", -skew(x[sensor]))]
     if sensor == "accelerometer" and "turn" in x:
@@ -191,7 +191,7 @@ def columns_of(sensor: str, x: Signals) -> list[tuple[str, Values]]:
     return [*columns, ("time_offset", x[sensor + "'"][:, :, None]), ("bias", bias)]
 
 
-def turned(x: Signals, R: Values, clear: Mapping[str, Values]) -> Signals:
+def turned(x: ChannelValues, R: Values, clear: Mapping[str, Values]) -> ChannelValues:
     """Return the signals of a chip in axes that R turns into the chip's axes, where they are clear of noise."""
     signals = {k: R.T @ v @ R if k == "turn" else v @ R if v.ndim == 2 else v for k, v in x.items()}
     level = {k: signals[k].mean(axis=0) if k == "accelerometer" else 0.0 for k in clear}
@@ -217,10 +217,10 @@ class RotationFits:
 
     R: Values
     fits: list[RotationFit]
-    rows: tuple[Signals, Signals]
-    clear: Signals  # which signals are clear of noise
+    rows: tuple[ChannelValues, ChannelValues]
+    clear: ChannelValues  # which signals are clear of noise
     blocks: Blocks  # stretches of time in which the difference of the biases is taken as constant
-    held_out: tuple[Signals, Signals] | None
+    held_out: tuple[ChannelValues, ChannelValues] | None
 
     @property
     def moving(self) -> Mask:
@@ -258,13 +258,15 @@ def fit_chips(reference: Chip, other: Chip, sensors: Sequence[str]) -> RotationF
     return RotationFits(R, fits, (a, b), clear, blocks, _joined(held_out) if held_out else None)
 
 
-def _joined(pairs: Sequence[tuple[Signals, Signals]]) -> tuple[Signals, Signals]:
+def _joined(pairs: Sequence[tuple[ChannelValues, ChannelValues]]) -> tuple[ChannelValues, ChannelValues]:
     """Return the rows of all recordings by each chip."""
     a, b = ({k: np.concatenate([pair[chip][k] for pair in pairs]) for k in pairs[0][chip]} for chip in (0, 1))
     return a, b
 
 
-def _fitted(sensors: Sequence[str], a: Signals, b: Signals) -> tuple[Values, Signals, list[RotationFit]]:
+def _fitted(
+    sensors: Sequence[str], a: ChannelValues, b: ChannelValues
+) -> tuple[Values, ChannelValues, list[RotationFit]]:
     """Return the rotation at which the fits are linear, which signals are clear of noise, and the fits.
 
     The start is the rotation that maps the vectors of a best onto the vectors of b (Wahba's problem, Markley's SVD).
@@ -283,7 +285,7 @@ def _fitted(sensors: Sequence[str], a: Signals, b: Signals) -> tuple[Values, Sig
     return R, clear, [_fit(s, R, a, b, clear) for s in sensors]
 
 
-def _fit(sensor: str, R: Values, a: Signals, b: Signals, clear: Mapping[str, Values]) -> RotationFit:
+def _fit(sensor: str, R: Values, a: ChannelValues, b: ChannelValues, clear: Mapping[str, Values]) -> RotationFit:
     """Return the estimate by one sensor: instrumental variables with the weak priors."""
     columns = columns_of(sensor, turned(a, np.eye(3), clear))
     X = np.concatenate([c for _, c in columns], axis=2)

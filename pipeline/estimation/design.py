@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 REMEMBERED = 4  # motions of a part after effects of timing: of the base, and of terms without their own effect
 # singular value of unit columns that is determined; share of its vector
 MIN_DESIGN_SINGULAR_VALUE, PART_OF_IT = 1e-3, 0.1
-SIGNALS = (  # fields of ``Motion`` on which formulas depend
+MOTION_FIELDS = (  # fields of ``Motion`` on which formulas depend
     "time", "specific_force", "angular_rate", "angular_acceleration", "temperature", "angle", "rate", "level",
     "direction",
 )  # fmt: skip
@@ -125,7 +125,9 @@ def motions_of(part: RecordingRows, terms: Sequence[EffectColumns]) -> list[Moti
 def _joined(motions: Sequence[Motion]) -> list[tuple[Motion, list[Motion]]]:
     """Return the motions of successive recordings that hold the same signals as one, each with those that it joins."""
     joined = []
-    for held, group in groupby(motions, lambda motion: [name for name in SIGNALS if getattr(motion, name) is not None]):
+    for held, group in groupby(
+        motions, lambda motion: [name for name in MOTION_FIELDS if getattr(motion, name) is not None]
+    ):
         members = list(group)
         if "direction" not in held:  # it is computed from the whole motion
             joined += [(each, [each]) for each in members]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pipeline.records import Index, Values
 
 Pick: TypeAlias = tuple[int, int]  # version and scale of an effect
-Set: TypeAlias = frozenset[str]
+EffectSet: TypeAlias = frozenset[str]
 
 # The prior was chosen on 738 simulated sensors: docs/blind_study.md.
 LIMIT_SCALES = np.array([0.02, 0.06, 0.2, 0.6, 2.0, 20.0])  # of the sensor file's limits
@@ -58,7 +58,7 @@ class CandidateProblem:
     free: float  # nu
     versions: Mapping[str, Sequence[Version]]
     limits: Mapping[str, Values]  # (k,), of the parameters of each effect; the unit of its columns
-    excluded: Mapping[str, Set] = field(default_factory=dict)  # effects that are never in a set with this one
+    excluded: Mapping[str, EffectSet] = field(default_factory=dict)  # effects that are never in a set with this one
     least: float = 0.0  # lower bound of sigma^2
 
     @cached_property
@@ -100,7 +100,7 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
     size: Values,
     prior: Values,
     known: tuple[Mapping[str, Values], Mapping[str, Values]],
-    excluded: Mapping[str, Set],
+    excluded: Mapping[str, EffectSet],
     *,
     samples: float,
     free: float,

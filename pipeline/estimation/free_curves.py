@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
     from pipeline.records import Motion, Values
 
-OTHER = "other_"  # prefix of the names of free curves
+OTHER_PREFIX = "other_"  # prefix of the names of free curves
 BEND = ":bend"  # suffix of the name of the second form; answers state it under the name of the first
 BEND_WIDTHS = np.geomspace(0.1, 0.5, 12)  # of a bend, shares of the span: sharper ones are steps, wider ones parabolas
 # Prior probability of a bend over that of an effect. With it, a bend was an answer in all 54 simulated units (seed 61)
 # that hid one and selected a slow effect, and below 0.5 in all 34 (seed 62) that hid the slow effect.
-BEND_SHARE = 0.5
+MAX_BEND_SHARE_OF_ROOM = 0.5
 CURVE_DEGREE = 5  # up to four turning points over the span; faster changes are steps
 MAX_CURVE_CYCLES = 8  # periods a turn
 
@@ -46,7 +46,7 @@ class FreeCurve(Effect):
     meaning, excitation, experiment, source = "Physics outside the catalogue.", "", "", ""
 
     def __init__(self, covariate: str, low: float, high: float) -> None:
-        self.covariate, self.name = covariate, f"{OTHER}{covariate}"
+        self.covariate, self.name = covariate, f"{OTHER_PREFIX}{covariate}"
         self.contains = (self.name + BEND,)
         self.middle, self.half = 0.5 * (low + high), 0.5 * (high - low)
         self.layout = Layout.PER_AXIS if covariate == "input" else Layout.EVERY_AXIS
@@ -81,7 +81,12 @@ class FreeCurve(Effect):
 class Bend(Effect):
     """A bend in the dependence on temperature, from one end of the span, with a coefficient for each axis."""
 
-    name, owner, layout, needs = f"{OTHER}temperature{BEND}", Owner.RECORDING, Layout.EVERY_AXIS, ("temperature",)
+    name, owner, layout, needs = (
+        f"{OTHER_PREFIX}temperature{BEND}",
+        Owner.RECORDING,
+        Layout.EVERY_AXIS,
+        ("temperature",),
+    )
     meaning, excitation, experiment, source = "Physics outside the catalogue.", "", "", ""
 
     def __init__(self, forms: Sequence[tuple[float, float, bool]], form: int = 0) -> None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from pipeline.records import Values
 
-State = TypeVar("State")
+FitState = TypeVar("FitState")
 MAX_STEP_HALVINGS = 30  # of a step; a smaller one is rounding
 RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
 PART_OF_NULL_SPACE = 1e-3  # component of a unit vector of it, above which a parameter is named as not determined
@@ -117,13 +117,13 @@ def cholesky(matrix: Values) -> Values:
 
 
 def gauss_newton(  # noqa: PLR0917  (what an iteration is)
-    residual_at: Callable[[State], tuple[Values, Values]],
-    start: State,
-    moved: Callable[[State, Values], tuple[State, Values]],
+    residual_at: Callable[[FitState], tuple[Values, Values]],
+    start: FitState,
+    moved: Callable[[FitState, Values], tuple[FitState, Values]],
     small: Callable[[Values, ScaledColumns], bool] | None,
     iterations: int,
     tolerance: float = RANK_TOLERANCE,
-) -> tuple[State, tuple[Values, Values], int]:
+) -> tuple[FitState, tuple[Values, Values], int]:
     """Minimise ``|r|`` by Gauss-Newton steps, each halved while it does not lower ``|r|``.
 
     ``residual_at``: state to its residuals (n,) and their derivative (n, p). ``moved``: state and step (p,) to the new

@@ -53,11 +53,11 @@ from pipeline.signal.rests import rest_readings, usable
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.noise_search import Candidate
+    from pipeline.estimation.noise_search import FittedComposition
     from pipeline.estimation.noise_terms import Spectrum
+    from pipeline.files import JSON
     from pipeline.records import Recording, Values
 
-    JSON = dict[str, Any]
 
 MIN_SPECTRUM_SAMPLES = 60  # which determine the white noise to a tenth
 SHORTEST_STRETCH = 16  # samples
@@ -72,8 +72,8 @@ AVERAGES_PER_DECADE = 8
 MOST_PUBLISHED = 12  # compositions
 DERIVATIVE_STEP = 1.01  # of a correlation time, for a derivative
 SLOW_TERMS = ("bias_instability", "random_walk", "gauss_markov", "ramp", "temperature")
-STILL = {"terms": None, "reason": "the readings do not change: the noise is below one count"}
-OF_RESTS = "no static recording: what is slower than a rest is not seen, and in rests by hand the unit moves"
+CONSTANT_READINGS = {"terms": None, "reason": "the readings do not change: the noise is below one count"}
+DOUBT_OF_RESTS = "no static recording: what is slower than a rest is not seen, and in rests by hand the unit moves"
 NOT_FITTED = {
     "ramp": "only a static recording shows it",
     "temperature": "the temperature did not change, or only as a ramp",
@@ -139,7 +139,7 @@ def identify_noise(recordings: Sequence[Recording]) -> dict[str, JSON]:
         documents[sensor] = document
         if not stretches:
             continue
-        document["axes"] = dict.fromkeys(AXES, STILL)
+        document["axes"] = dict.fromkeys(AXES, CONSTANT_READINGS)
         single = document["source"] == "static" and len(document["recordings"]) == 1
         for c in range(3):
             steps = np.concatenate([np.abs(np.diff(s.reading[:, c])) for s in stretches])
@@ -185,7 +185,7 @@ def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[Re
         "samples": _samples(stretches),
         "sampling_interval_s": interval,
         "length_s": float(interval * max(len(s.time) for s in stretches)),
-        "doubts": [OF_RESTS] if source == "rests" else [],
+        "doubts": [DOUBT_OF_RESTS] if source == "rests" else [],
     }
     return document, stretches
 
@@ -243,7 +243,7 @@ def _axes(regressions: Sequence[Regression]) -> list[JSON]:
 def _axis(
     regression: Regression,
     search: CompositionSearch,
-    best: Candidate,
+    best: FittedComposition,
     bounds: tuple[Values, dict[int, float]],
     measured: tuple[Values, Values],
 ) -> JSON:
@@ -293,7 +293,7 @@ def _axis(
     }
 
 
-def _present(best: Candidate, within: Values, regression: Regression) -> list[SeenTerm]:
+def _present(best: FittedComposition, within: Values, regression: Regression) -> list[SeenTerm]:
     """Return the stochastic terms of a composition; ``within``: intervals of the parameters."""
     n, terms = len(best.kinds), []
     for j, kind in enumerate(best.kinds):
@@ -309,7 +309,7 @@ def _present(best: Candidate, within: Values, regression: Regression) -> list[Se
 def _allan(  # noqa: PLR0917  (the curve and its terms)
     tau: Values,
     measured: Values,
-    best: Candidate,
+    best: FittedComposition,
     present: Sequence[SeenTerm],
     deterministic: Sequence[SeenTerm],
     spectrum: Spectrum,
@@ -354,7 +354,7 @@ def _reason(kind: int, names: Sequence[str], spectrum: Spectrum) -> str:
     )
 
 
-def _sinusoids(regression: Regression, best: Candidate) -> list[SeenTerm]:
+def _sinusoids(regression: Regression, best: FittedComposition) -> list[SeenTerm]:
     """Return the sinusoids of the most probable composition."""
     beta, covariance = best.fit.beta[0], best.fit.beta_covariance[0]
     sinusoids = []
@@ -369,7 +369,9 @@ def _sinusoids(regression: Regression, best: Candidate) -> list[SeenTerm]:
     return sinusoids
 
 
-def _slope(regression: Regression, best: Candidate, spectrum: Spectrum, name: str, per: float) -> SeenTerm | UnseenTerm:
+def _slope(
+    regression: Regression, best: FittedComposition, spectrum: Spectrum, name: str, per: float
+) -> SeenTerm | UnseenTerm:
     """Return the term of a deterministic column; the column is ``per`` times its unit."""
     unit = f"{regression.unit}/degC" if name == "temperature" else unit_of(name, regression.unit)
     if name not in regression.optional:

@@ -78,7 +78,7 @@ MOST_ROUNDS = 6
 
 
 @dataclass(frozen=True)
-class Candidate:
+class FittedComposition:
     """One fitted composition: stochastic terms and deterministic columns (by number)."""
 
     kinds: Composition
@@ -99,9 +99,9 @@ class CompositionSearch:
     def __init__(self, spectrum: Spectrum, axis: int) -> None:
         self.spectrum, self.axis = spectrum, axis
         self.penalty = float(np.log(spectrum.size))
-        self.found: dict[tuple[Composition, tuple[int, ...]], Candidate] = {}
+        self.found: dict[tuple[Composition, tuple[int, ...]], FittedComposition] = {}
 
-    def run(self, columns: tuple[int, ...], start: Candidate | None = None) -> Work[Candidate]:
+    def run(self, columns: tuple[int, ...], start: FittedComposition | None = None) -> Work[FittedComposition]:
         """Return the best composition with these deterministic columns.
 
         ``start``: a composition with other columns, from which the search begins if it is better than white noise.
@@ -126,7 +126,7 @@ class CompositionSearch:
                 return best
             best = new
 
-    def _best(self, columns: tuple[int, ...]) -> Candidate:
+    def _best(self, columns: tuple[int, ...]) -> FittedComposition:
         """Return the best composition so far with these columns."""
         return min((c for c in self.found.values() if c.columns == columns), key=lambda c: c.bic)
 
@@ -140,9 +140,9 @@ class CompositionSearch:
             key, bic = (trial.kinds, columns), float(fits.unrestricted[g])
             bic += count_of(*key) * self.penalty
             if key not in self.found or bic < self.found[key].bic:
-                self.found[key] = Candidate(*key, fits.own(g), bic, fits.rows(slice(g, g + 1)))
+                self.found[key] = FittedComposition(*key, fits.own(g), bic, fits.rows(slice(g, g + 1)))
 
-    def _added(self, candidate: Candidate) -> list[tuple[Composition, Values]]:
+    def _added(self, candidate: FittedComposition) -> list[tuple[Composition, Values]]:
         """Return compositions with one additional term whose score predicts a gain, and their starts."""
         spectrum = self.spectrum
         absent = [k for k in SINGLE if k not in candidate.kinds]
@@ -162,14 +162,14 @@ class CompositionSearch:
         return out
 
 
-def _without(candidate: Candidate, index: int) -> tuple[Composition, Values]:
+def _without(candidate: FittedComposition, index: int) -> tuple[Composition, Values]:
     """Return a composition without one term, and its start."""
     n = len(candidate.kinds)
     kinds = candidate.kinds[:index] + candidate.kinds[index + 1 :]
     return kinds, np.delete(candidate.parameters, [index, n + index])
 
 
-def _with_term(candidate: Candidate, kind: int, size: float, log_time: float) -> tuple[Composition, Values]:
+def _with_term(candidate: FittedComposition, kind: int, size: float, log_time: float) -> tuple[Composition, Values]:
     """Return a composition with one additional term, and its start."""
     kinds = candidate.kinds
     place = sum(k <= kind for k in kinds)
@@ -195,7 +195,7 @@ def _scores(spectrum: Spectrum, fit: TermFits, shapes: Values) -> tuple[Values, 
     return gain, np.maximum(u / information, 0.01 * spread), spread
 
 
-def limits(spectrum: Spectrum, best: Candidate) -> Work[tuple[Values, dict[int, float]]]:
+def limits(spectrum: Spectrum, best: FittedComposition) -> Work[tuple[Values, dict[int, float]]]:
     """Return the 95 % intervals of the parameters, and the upper limits of absent terms without a correlation time.
 
     The intervals are a (2, 2 k) array, NaN for terms without a correlation time; the limits are of squared
@@ -223,7 +223,9 @@ def limits(spectrum: Spectrum, best: Candidate) -> Work[tuple[Values, dict[int, 
     return within, dict(zip(absent, upper.tolist(), strict=True))
 
 
-def _crossing(best: Candidate, trial: TermTrial, j: int, step: float, *, one_sided: bool = False) -> Work[float]:
+def _crossing(
+    best: FittedComposition, trial: TermTrial, j: int, step: float, *, one_sided: bool = False
+) -> Work[float]:
     """Return the change of parameter j at which -2 log L of the profile rises by the square of the quantile.
 
     ``step``: a first guess.
@@ -250,7 +252,7 @@ def _crossing(best: Candidate, trial: TermTrial, j: int, step: float, *, one_sid
     return sign * size
 
 
-def best_of(search: CompositionSearch, required: tuple[int, ...], optional: Sequence[int]) -> Work[Candidate]:
+def best_of(search: CompositionSearch, required: tuple[int, ...], optional: Sequence[int]) -> Work[FittedComposition]:
     """Return the best composition over all choices of the optional deterministic columns.
 
     With white noise only, a column that gains less than ``SLIGHT_GAIN`` of -2 log L is not used.
@@ -321,7 +323,7 @@ class Regression:
         first = 1 + len(self.optional)
         return tuple(range(first, first + 3 * len(self.lines)))
 
-    def names(self, candidate: Candidate) -> list[str]:
+    def names(self, candidate: FittedComposition) -> list[str]:
         """Return the names of the terms of a composition."""
         names = [*self.optional, *["sinusoid", "", ""] * len(self.lines)]
         deterministic = [names[c - 1] for c in sorted(candidate.columns)]

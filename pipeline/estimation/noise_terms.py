@@ -56,7 +56,7 @@ QUANTISATION, WHITE, INSTABILITY, WALK, MARKOV = range(5)
 PER_AVERAGE = 64  # overlapping terms of the sum in one average
 SINGLE = (QUANTISATION, WHITE, INSTABILITY, WALK)
 STOCHASTIC = ("quantisation", "white", "bias_instability", "random_walk", "gauss_markov")
-UNITS = {
+TERM_UNITS = {
     "quantisation": "{0} s", "white": "{0}/sqrt(Hz)", "bias_instability": "{0}", "random_walk": "{0}/sqrt(s)",
     "gauss_markov": "{0}", "ramp": "{0}/s", "sinusoid": "{0}",
 }  # fmt: skip
@@ -72,7 +72,7 @@ Composition = tuple[int, ...]  # a set of stochastic terms: their kinds, in risi
 
 def unit_of(term: str, unit: str) -> str:
     """Return the unit of a term's coefficient for a sensor's unit."""
-    return UNITS[term].format(unit)
+    return TERM_UNITS[term].format(unit)
 
 
 def fixed_shapes(omega: Values, interval: float) -> Values:
@@ -211,11 +211,11 @@ class TermFits:
 
     def rows(self, index: Integers | Mask | slice) -> TermFits:
         """Return some of the fits."""
-        return TermFits(*(getattr(self, name)[index] for name in NAMES))
+        return TermFits(*(getattr(self, name)[index] for name in FIT_FIELDS))
 
     def replace(self, index: Integers | Mask, others: TermFits) -> None:
         """Replace some of the fits."""
-        for name in NAMES[3:]:
+        for name in FIT_FIELDS[3:]:
             getattr(self, name)[index] = getattr(others, name)
 
     def own(self, row: int = 0) -> Values:
@@ -234,7 +234,7 @@ class TermFits:
         return np.asarray(np.linalg.inv(self.information(count)), np.float64)
 
 
-NAMES = tuple(f.name for f in fields(TermFits))
+FIT_FIELDS = tuple(f.name for f in fields(TermFits))
 Result = TypeVar("Result")
 if TYPE_CHECKING:
     Work = Generator[list[TermTrial], TermFits, Result]  # yields trials, receives their fits, returns a result

@@ -24,9 +24,9 @@ from pipeline.estimation.evidence import (
     NEGLIGIBLE_MIXTURE_WEIGHT,
     SCALE_PRIOR,
     CandidateProblem,
+    EffectSet,
     Given,
     Pick,
-    Set,
 )
 from pipeline.estimation.free_curves import BEND
 from pipeline.estimation.selection import DELAYS
@@ -91,8 +91,8 @@ class SetSearch:
         self, problem: CandidateProblem, required: Iterable[str] = (), seeds: Iterable[Iterable[str]] = ()
     ) -> None:
         self.problem, self.required = problem, frozenset(required)
-        self.pool: dict[Set, Found] = {}
-        self._extended: set[Set] = set()
+        self.pool: dict[EffectSet, Found] = {}
+        self._extended: set[EffectSet] = set()
         first = [*dict.fromkeys([self.required, *(frozenset(seed) | self.required for seed in seeds)])]
         self._prune(first)
         for names in first:
@@ -102,15 +102,15 @@ class SetSearch:
         for names in self._best(MOST_NEAR, EXTENDED_LOG_EVIDENCE):
             self._finish(names)
 
-    def best(self, among: Iterable[Set] = ()) -> Set:
+    def best(self, among: Iterable[EffectSet] = ()) -> EffectSet:
         """Return the most probable set of all, or of some."""
         return max(among or self.pool, key=lambda names: self.pool[names].score)
 
-    def given(self, names: Set, but: Set = frozenset()) -> Given:
+    def given(self, names: EffectSet, but: EffectSet = frozenset()) -> Given:
         """Return the problem given a set without some of its members."""
         return Given(self.problem, [{n: pick for n, pick in self.pool[names].picks.items() if n not in but}])
 
-    def _prune(self, seeds: Sequence[Set]) -> None:
+    def _prune(self, seeds: Sequence[EffectSet]) -> None:
         """Remove the noise hypotheses that have no weight given any of the sets ``seeds``."""
         kept = np.zeros(len(self.problem.prior), bool)
         for names in seeds:
@@ -121,7 +121,7 @@ class SetSearch:
             kept |= np.any(scores > scores.max(axis=0) + np.log(NEGLIGIBLE_MIXTURE_WEIGHT), axis=1)
         self.problem = self.problem.under(kept)
 
-    def _allowed(self, names: Set) -> list[str]:
+    def _allowed(self, names: EffectSet) -> list[str]:
         barred = names.union(*(self.problem.excluded.get(n, frozenset()) for n in names))
         return [n for n in self.problem.versions if n not in barred]
 
@@ -135,7 +135,7 @@ class SetSearch:
                 self._finish(names)
             level = self._near(level, EXTENDED_LOG_EVIDENCE)
 
-    def _near(self, level: list[Set], within: float) -> list[Set]:
+    def _near(self, level: list[EffectSet], within: float) -> list[EffectSet]:
         """Return the sets that are within a distance of the best of all, and all single effects."""
         least = self.pool[self.best()].score - within
         return [n for n in level if len(n) <= len(self.required) + 1 or self.pool[n].score > least]
@@ -151,12 +151,12 @@ class SetSearch:
                 self._extend([best])
                 return
 
-    def _best(self, most: int, within: float) -> list[Set]:
+    def _best(self, most: int, within: float) -> list[EffectSet]:
         top = self.pool[self.best()].score
         near = [names for names, found in self.pool.items() if found.score > top - within]
         return sorted(near, key=lambda names: -self.pool[names].score)[:most]
 
-    def _extend(self, level: Sequence[Set]) -> list[Set]:
+    def _extend(self, level: Sequence[EffectSet]) -> list[EffectSet]:
         """Add every allowed effect to some sets; return the new sets."""
         level = [names for names in level if len(names) < MAX_SET_SIZE + len(self.required)]
         new = [names for names in level if names not in self._extended]
@@ -176,7 +176,7 @@ class SetSearch:
                     self.pool[child] = Found(score, {**parent.picks, name: pick}, spread, final=len(child) == 1)
         return list(dict.fromkeys(names | {name} for names in level for name in self._allowed(names)))
 
-    def _finish(self, names: Set) -> None:
+    def _finish(self, names: EffectSet) -> None:
         """Determine the best versions and scales of a set, and average over all."""
         known = self.pool.get(names)
         if known is not None and known.final:
@@ -203,7 +203,7 @@ def _largest(evidence: Values) -> tuple[float, Pick]:
     return float(evidence[v, s]), (v, s)
 
 
-def answers(searches: Sequence[SetSearch | None], owner: Callable[[Set], int], names: Iterable[str]) -> Answers:
+def answers(searches: Sequence[SetSearch | None], owner: Callable[[EffectSet], int], names: Iterable[str]) -> Answers:
     """Combine the results of several searches of the same readings.
 
     ``searches``: None if none of its sets is possible. ``owner``: index of the search to which a set belongs.
@@ -230,12 +230,12 @@ def answers(searches: Sequence[SetSearch | None], owner: Callable[[Set], int], n
     return Answers(sets, _upper_limits([name for name in names if not name.endswith(BEND)], likely))
 
 
-def _upper_limits(names: Sequence[str], likely: Sequence[tuple[SetSearch, Set]]) -> dict[str, Values]:
+def _upper_limits(names: Sequence[str], likely: Sequence[tuple[SetSearch, EffectSet]]) -> dict[str, Values]:
     """Return the upper limits of effects' parameters, given that each is present in addition to likely sets."""
     parts: dict[str, list[tuple[Values, Values, Values]]] = {}
     seen = set()
     for search, members in likely:
-        by_rest: dict[Set, list[str]] = {}  # effects by the other members of the set
+        by_rest: dict[EffectSet, list[str]] = {}  # effects by the other members of the set
         for name in (n for n in names if n in search.problem.versions):
             barred = search.problem.excluded.get(name, frozenset())
             rest = members - ((barred | {name}) - (search.required - {name}))
@@ -297,7 +297,7 @@ def prior_limit() -> float:
     return float(quantiles([(np.exp(SCALE_PRIOR), np.zeros((len(LIMIT_SCALES), 1)), LIMIT_SCALES[:, None])])[0][0])
 
 
-def excluded(effects: Sequence[Effect]) -> dict[str, Set]:
+def excluded(effects: Sequence[Effect]) -> dict[str, EffectSet]:
     """Return the effects that are never in a set with each: those that contain one another, and the two delays."""
     barred: dict[str, set[str]] = {this.name: set() for this in effects}
     for this in effects:

@@ -32,7 +32,17 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError
 from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
-from pipeline.records import BASE, NORMAL, SENSORS, Contribution, Estimate, SensorCalibration, StageResult, Step, Values
+from pipeline.records import (
+    BASE,
+    NORMAL,
+    SENSORS,
+    Contribution,
+    CorrectionStep,
+    Estimate,
+    SensorCalibration,
+    StageResult,
+    Values,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -238,7 +248,7 @@ def _given(method: Method) -> dict[str, Any]:
 
 def staged_result(  # noqa: PLR0917  (the results of a stage)
     name: str,
-    steps: Sequence[Step],
+    steps: Sequence[CorrectionStep],
     parameters: Mapping[str, Estimate],
     error: Values,
     samples: tuple[int, int],

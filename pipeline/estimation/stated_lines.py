@@ -27,7 +27,7 @@ from pipeline.estimation.table_errors import TIME_BASE, type_b
 from pipeline.estimation.uncertainty_budget import (
     GRAVITY,
     NOT_STATED,
-    QUANTISATION,
+    QUANTISATION_SOURCE,
     clock_contribution,
     with_uncertainty,
 )
@@ -110,13 +110,13 @@ def _rounding(
         noise is None
         or noise.step is None
         or by_moves
-        or any(line.source == QUANTISATION for line in calibration.lines)
+        or any(line.source == QUANTISATION_SOURCE for line in calibration.lines)
     ):
         return []
     largest, unit = float(noise.step.max()), SENSOR_UNITS[calibration.sensor]
     effect = np.eye(len(calibration.parameters))[:, BIAS] * noise.step / largest
     remark = f"readings in steps of up to {largest:.3g} {unit} with less noise than half a step: log more digits"
-    return [type_b(QUANTISATION, RECTANGULAR, largest / np.sqrt(12.0), unit, effect, remark)]
+    return [type_b(QUANTISATION_SOURCE, RECTANGULAR, largest / np.sqrt(12.0), unit, effect, remark)]
 
 
 def _counted_time(

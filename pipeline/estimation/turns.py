@@ -33,7 +33,7 @@ DELAYS_TO_FOLLOW = 5.0  # after which an RC filter holds less than 1 % of a chan
 MEAN_S = 1.0  # a mean hides no motion at rest, and keeps the readings' change with temperature
 MEDIAN_OF_DIFFERENCES = 0.9099  # median of (w[n+1] - w[n])^2 of white noise of variance 1: 2 times that of chi-square
 SCATTERED = 6.0  # standard deviations of a chi-square above its mean, and half its square for the tail of few samples
-BEND_DPS, BEND_SHARE = 0.05, 1e-3  # see ``reference_valid``
+MAX_BEND_DPS, MAX_BEND_SHARE = 0.05, 1e-3  # see ``reference_valid``
 
 
 @dataclass(frozen=True)
@@ -293,5 +293,5 @@ def reference_valid(motion: Motion) -> Mask:
             weight = np.prod([(t[2] - t[k]) / (t[j] - t[k]) for k in others], axis=0)
             guess += weight[:, None] * rate[j : len(time) - 4 + j]
         bend[2:-2] = np.abs(guess - rate[2:-2]).max(axis=1)
-    bends = bend > np.maximum(BEND_DPS, BEND_SHARE * np.abs(rate).max(axis=1))
+    bends = bend > np.maximum(MAX_BEND_DPS, MAX_BEND_SHARE * np.abs(rate).max(axis=1))
     return np.asarray(np.convolve(bends, np.ones(3), "same") < 0.5)

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 # accuracies, 18 to 73 % with 0.02 deg between its axes (12 simulated units each, 18 positions)
 CHANCE_VARIANCE_SHARE = 0.1
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
-NOISE, QUANTISATION = "noise of the readings", "quantisation"
+NOISE_SOURCE, QUANTISATION_SOURCE = "noise of the readings", "quantisation"
 NOT_STATED = "one calibration does not show it: calibrate the unit again after switching it off"
 TEMPERATURE = "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is stated"
 ACROSS = (
@@ -94,7 +94,7 @@ def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: WanderPrior)
         "bias wander": np.sqrt(wander),
         "lack of fit": np.sqrt(np.clip(total - white - wander, 0.0, None)),
     }
-    return Contribution(NOISE, "A", "Student's t", covariance, freedom, parts=parts)
+    return Contribution(NOISE_SOURCE, "A", "Student's t", covariance, freedom, parts=parts)
 
 
 def scatter_contribution(
@@ -102,7 +102,7 @@ def scatter_contribution(
 ) -> Contribution:
     """Return the contribution of the readings' scatter for a fit that computes its covariance directly."""
     freedom = np.full(len(covariance), float(degrees_of_freedom))
-    return Contribution(NOISE, "A", "Student's t", covariance, freedom, parts=dict(parts or {}), remark=remark)
+    return Contribution(NOISE_SOURCE, "A", "Student's t", covariance, freedom, parts=dict(parts or {}), remark=remark)
 
 
 def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float, unit: str) -> Contribution | str:
@@ -113,11 +113,11 @@ def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float, 
     """
     step = 1.0 / counts_per_unit
     if np.all(noise.white >= DITHERED * step):
-        return f"contained in the {NOISE}, which reach {float(noise.white.min()) / step:.1f} counts or more"
+        return f"contained in the {NOISE_SOURCE}, which reach {float(noise.white.min()) / step:.1f} counts or more"
     label = noise.blocks.label(int(noise.blocks.weight.sum()))
     rough = np.where(noise.white < DITHERED * step, 1.0, 0.0) * np.ones((len(label), 3))
     effects = [fit.of_groups(rough * axis, label, len(noise.blocks.weight)) for axis in np.eye(3)]
-    return type_b(QUANTISATION, RECTANGULAR, step / np.sqrt(12.0), unit, np.concatenate(effects, axis=1))
+    return type_b(QUANTISATION_SOURCE, RECTANGULAR, step / np.sqrt(12.0), unit, np.concatenate(effects, axis=1))
 
 
 def gravity_line(calibration: SensorCalibration, table: Table) -> tuple[list[Contribution], dict[str, str]]:
@@ -207,11 +207,15 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
 
     def rounding(fit: LinearMap) -> Contribution | str:
         of_samples = noise.row_weight is None
-        return _quantisation(noise, fit, counts, SENSOR_UNITS[sensor]) if of_samples else f"contained in the {NOISE}"
+        return (
+            _quantisation(noise, fit, counts, SENSOR_UNITS[sensor])
+            if of_samples
+            else f"contained in the {NOISE_SOURCE}"
+        )
 
     lines, missing, rounded = list(contributions), {"temperature": TEMPERATURE}, rounding(fit)
     if isinstance(rounded, str):
-        missing[QUANTISATION] = rounded
+        missing[QUANTISATION_SOURCE] = rounded
     else:
         lines.append(rounded)
     modelled = [*estimated, *(e.name for e in calibration.effects)]

@@ -9,8 +9,8 @@ and how ``convert`` reads it), and the text of the file in Jinja2. The text has 
     unit, document             name of the unit, its calibration
     sheets, gravity_g          figures of each sensor (``sensors.SensorFigures``); local gravity, g
 
-and the functions of ``sensors.FUNCTIONS``. The name of the template without ``.j2`` is the name of the format and, by
-default, of its file. Formats are listed nowhere else.
+and the functions of ``sensors.TEMPLATE_FUNCTIONS``. The name of the template without ``.j2`` is the name of the format
+and, by default, of its file. Formats are listed nowhere else.
 
 ``calibration.h`` has the effects as C expressions (``plan_of``). It performs the operations of
 ``pipeline.model.compensation`` for one sample, in the same order. Double precision without fused operations and without
@@ -34,8 +34,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from pipeline.errors import ConfigurationError
 from pipeline.exports.sensors import (
-    FACTORS,
-    FUNCTIONS,
+    TEMPLATE_FUNCTIONS,
+    UNIT_FACTORS,
     ExportedSensor,
     SensorFigures,
     before_use,
@@ -47,20 +47,20 @@ from pipeline.model.compensation import OF_THE_PAST, SMOOTHING_S, Steps, circula
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE
 from pipeline.model.formula import c_number
-from pipeline.model.log_motion import SIGNALS
+from pipeline.model.log_motion import FIELDS_OF_SIGNALS
 from pipeline.model.measurement import sensor_effects
 from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from pipeline.files import JSON
     from pipeline.settings import Settings
 
-JSON = dict[str, Any]
 TEMPLATES = Path(__file__).parent / "templates"
 # of the fixed point: each gains about two digits, and a relative error of 1e-13 is the goal
 FIXED_POINT_ITERATIONS = 12
-IN_C = set(SIGNALS) - {"specific_force_rate"}
+IN_C = set(FIELDS_OF_SIGNALS) - {"specific_force_rate"}
 CALL = re.compile(r"(\w+)\(")  # of a function in C
 
 
@@ -100,7 +100,7 @@ def _environment() -> Environment:
         extensions=["jinja2.ext.do"],
     )
     environment.filters |= {"comment": _comment, "json": _json, "yaml": _yaml, "numbers": _numbers}
-    environment.globals |= {**FUNCTIONS, "plan_of": plan_of}
+    environment.globals |= {**TEMPLATE_FUNCTIONS, "plan_of": plan_of}
     return environment
 
 
@@ -118,7 +118,7 @@ def formats() -> dict[str, tuple[Format, Template]]:
     keys = [key for key in dataclass_fields(Format) if key.name != "file"]
     required = [key.name for key in keys if key.default is MISSING and key.default_factory is MISSING]
     checks: dict[str, Check] = {key.name: lambda value: value for key in dataclass_fields(Format)}
-    check = fields(checks | {"units": each(one_of(*FACTORS))}, required)
+    check = fields(checks | {"units": each(one_of(*UNIT_FACTORS))}, required)
     formats_by_name: dict[str, tuple[Format, Template]] = {}
     for template in sorted(TEMPLATES.glob("*.j2")):
         header, _, text = template.read_text(encoding="utf-8").partition("\n---\n")

@@ -16,8 +16,8 @@ import numpy as np
 from pipeline.errors import ConfigurationError
 from pipeline.exports import ExportedUnit, export, formats, text_of
 from pipeline.exports.reading import CALIBRATION, ImportedCalibration, counts_of, read_any
-from pipeline.exports.sensors import FACTORS, SI, ExportedSensor, SensorFigures, before_use
-from pipeline.files import json_text, write_atomically
+from pipeline.exports.sensors import SI, UNIT_FACTORS, ExportedSensor, SensorFigures, before_use
+from pipeline.files import JSON, json_text, write_atomically
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect_of
 from pipeline.model.measurement import sensor_effects
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-JSON = dict[str, Any]
 CONVERSION_TOLERANCE = 1e-9  # g, deg/s or 1: smaller differences of a converted parameter are rounding
 WALK_S = 100.0  # correlation time of the wander that represents a random walk: K = s sqrt(2 / T), for any T
 
@@ -78,8 +77,8 @@ def with_noise(sheets: Mapping[str, SensorFigures], imported: ImportedCalibratio
         if density is not None and walk is not None:
             found[s] = replace(
                 sheets.get(s, SensorFigures()),
-                noise_density=np.sqrt(2.0) * density / FACTORS[unit],  # one-sided
-                bias_wander=walk / FACTORS[unit] * np.sqrt(WALK_S / 2.0),
+                noise_density=np.sqrt(2.0) * density / UNIT_FACTORS[unit],  # one-sided
+                bias_wander=walk / UNIT_FACTORS[unit] * np.sqrt(WALK_S / 2.0),
                 wander_time_s=WALK_S,
                 noise_origin=f"as {imported.format_name} states it",
             )

@@ -25,7 +25,7 @@ from jinja2 import TemplateError
 from imu_logs.files import read_text
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, first
 from pipeline.exports import formats
-from pipeline.exports.sensors import FACTORS, FUNCTIONS
+from pipeline.exports.sensors import TEMPLATE_FUNCTIONS, UNIT_FACTORS
 from pipeline.exports.text_kinds import Expressions, Node, parsed
 from pipeline.io.axis_maps import STRAIGHT, maps_of_log
 from pipeline.model.calibration_file import read_calibration, sensor_of
@@ -46,7 +46,7 @@ MAX_CALIBRATION_BYTES = 50_000_000
 UNIT_SCALE = (0.5, 2.0)  # range of the singular values of a matrix if readings and truth have the same unit
 EFFECT_IN_C = re.compile(r"r\[\d\] -= .*/\* (\w+) \*/")  # a line of calibration.h
 TURNED_READINGS = re.compile(r"Turn\s+the\s+readings\s+to\s+body\s+axes\s+first:\s[^.]*\.")  # a remark in our exports
-OWNER = re.compile(r"the (\w+)'s x along")  # in such a remark: a sensor, or "sensor" for both
+FRAME_REMARK = re.compile(r"the (\w+)'s x along")  # in such a remark: a sensor, or "sensor" for both
 BODY_AXIS = re.compile(r"along body ([+-][xyz])")
 NOISE_ALONE = re.compile(r"^\s*(accelerometer|gyroscope)_noise_density\s*:", re.MULTILINE)  # Kalibr's imu.yaml
 FORMAT_ROUNDING = 1e-12  # rounding errors of the formats' arithmetic, relative to the largest number
@@ -134,7 +134,9 @@ def _read_file(
 
 def _stated_axes(remarks: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Return the axis map of each sensor from the remarks of a file; empty without a remark."""
-    stated = {owner[1]: tuple(BODY_AXIS.findall(remark)) for remark in remarks if (owner := OWNER.search(remark))}
+    stated = {
+        owner[1]: tuple(BODY_AXIS.findall(remark)) for remark in remarks if (owner := FRAME_REMARK.search(remark))
+    }
     return {s: stated.get(s) or stated.get("sensor") or STRAIGHT for s in SENSORS} if stated else {}
 
 
@@ -214,7 +216,7 @@ def _read(
     notes = (
         [f"not in the file, so the default: {', '.join(f'{k} = {v:g}' for k, v in omitted.items())}"] if omitted else []
     )
-    tree = Expressions({**FUNCTIONS, "file": Node({**content, **omitted}), "counts": per_unit})
+    tree = Expressions({**TEMPLATE_FUNCTIONS, "file": Node({**content, **omitted}), "counts": per_unit})
     calibrations = {}
     for s, expressions in sensors.items():
         tree.globals |= {key: tree.value(e) for key, e in declared.read_back.get("let", {}).items()}
@@ -235,7 +237,7 @@ def _calibration(
     sensor: str, declared: Format, values: Mapping[str, Any], counts: float | None, notes: list[str]
 ) -> SensorCalibration:
     """Return the calibration in g and deg/s from the values of the format's expressions."""
-    factor = FACTORS[declared.units[sensor]]
+    factor = UNIT_FACTORS[declared.units[sensor]]
     arrays = {key: np.asarray(value, float) for key, value in values.items()}
     matrix = arrays["matrix"].reshape(3, 3) if "matrix" in arrays else np.linalg.inv(arrays["K"].reshape(3, 3))
     if "bias_polynomial" in arrays:

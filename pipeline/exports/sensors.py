@@ -36,11 +36,11 @@ from pipeline.records import AXES, BIAS, SENSORS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.files import JSON
     from pipeline.records import SensorCalibration, Values
     from pipeline.settings import DataSheet
 
-JSON = dict[str, Any]
-FACTORS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "deg/s": 1.0, "rad/s": float(np.pi / 180.0)}
+UNIT_FACTORS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "deg/s": 1.0, "rad/s": float(np.pi / 180.0)}
 SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 AVERAGING_S = 1.0  # averaging time of the effective density in remarks
 FEWEST_AVERAGES = 9  # of a rest at the longest averaging time: 1 / sqrt(2 (9 - 1)) = 25 % (IEEE Std 952, annex C)
@@ -70,7 +70,7 @@ def noise(sheets: Mapping[str, SensorFigures], document: Mapping[str, Any]) -> d
         figures = noise_figures(sensor, sheets.get(sensor), document)
         for name, key in (("noise_density", "white"), ("random_walk", "walk")):
             value = figures[key]
-            parameters[f"{sensor}_{name}"] = None if value is None else float(value * FACTORS[SI[sensor]])
+            parameters[f"{sensor}_{name}"] = None if value is None else float(value * UNIT_FACTORS[SI[sensor]])
     return parameters
 
 
@@ -121,7 +121,7 @@ def noise_figures(sensor: str, sheet: SensorFigures | None, document: Mapping[st
     elif measured:
         figures |= {"walk_origin": "measured at rest", "walk_interval": _rms(measured)[1:]}
     elif bounds:
-        limit = f"{FACTORS[SI[sensor]] * max(v for v in limits if v):.3g} {SI[sensor]}/sqrt(s)"
+        limit = f"{UNIT_FACTORS[SI[sensor]] * max(v for v in limits if v):.3g} {SI[sensor]}/sqrt(s)"
         figures["walk_origin"] = (
             f"not found at rest ({identified['length_s']:.3g} s), below {limit}: the lesser of the sensor's "
             "configuration and this limit"
@@ -182,7 +182,7 @@ class ExportedSensor:
 
     def __init__(self, calibration: SensorCalibration, unit: str, sheet: SensorFigures | None) -> None:
         self.calibration, self.name, self.unit, self.sheet = calibration, calibration.sensor, unit, sheet
-        self.factor = FACTORS[unit]
+        self.factor = UNIT_FACTORS[unit]
         self.bias, self.matrix = calibration.bias * self.factor, calibration.matrix
         self.K: Values = np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)))
         of_sensor = [e for e in calibration.effects if owner_of(e) == Owner.SENSOR]
@@ -376,7 +376,7 @@ def plain(content: Any) -> Any:  # noqa: ANN401
     return content.tolist() if isinstance(content, (np.ndarray, np.generic)) else content
 
 
-FUNCTIONS: dict[str, Any] = {
+TEMPLATE_FUNCTIONS: dict[str, Any] = {
     "accelerometer_frame": accelerometer_frame,
     "identity": np.eye(3),
     "lever_arm_of": lever_arm_of,
@@ -392,8 +392,8 @@ FUNCTIONS: dict[str, Any] = {
     "rotation_times_lower": rotation_times_lower,
     "row_lengths": row_lengths,
     "sampling_rate": sampling_rate,
-    "FACTORS": FACTORS,
-    "RADIAN": FACTORS["rad/s"],
+    "FACTORS": UNIT_FACTORS,
+    "RADIAN": UNIT_FACTORS["rad/s"],
     "REFERENCE_TEMPERATURE": REFERENCE_TEMPERATURE,
     "SI": SI,
     "STANDARD_GRAVITY": STANDARD_GRAVITY,

@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 from jinja2 import Environment, StrictUndefined
 
-from pipeline.exports.sensors import FACTORS, shifted
+from pipeline.exports.sensors import UNIT_FACTORS, shifted
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class Expressions(Environment):
 
     def __init__(self, variables: dict[str, Any]) -> None:
         super().__init__(undefined=StrictUndefined, autoescape=False)  # no HTML
-        self.globals |= FUNCTIONS | variables
+        self.globals |= EXPRESSION_FUNCTIONS | variables
 
     def getattr(self, obj: Any, attribute: str) -> Any:  # noqa: ANN401
         """Return a value of a mapping, or an attribute of another object."""
@@ -251,12 +251,12 @@ def lower(values: Any) -> Values:  # noqa: ANN401
     return matrix
 
 
-FUNCTIONS: dict[str, Any] = {
+EXPRESSION_FUNCTIONS: dict[str, Any] = {
     "axes": axes,
     "diagonal": np.diag,
     "given": lambda node, key, default: node.get(key, default),
-    "in_dps": lambda unit: 1.0 / (1.0 if unit in NO_UNIT else FACTORS[unit]),
-    "in_g": lambda unit: 1.0 / (1.0 if unit in NO_UNIT else FACTORS[unit]),
+    "in_dps": lambda unit: 1.0 / (1.0 if unit in NO_UNIT else UNIT_FACTORS[unit]),
+    "in_g": lambda unit: 1.0 / (1.0 if unit in NO_UNIT else UNIT_FACTORS[unit]),
     "lower": lower,
     "product": product,
     "rotation": rotation,

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 BLOCKS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE, "table_attitude": ATTITUDE}
 SINGLES = ("temperature", "table_angle", "table_rate", "flags")
-SCHEMA_VERSION = 4
+PARQUET_VERSION = 4
 ROW_GROUP = 1_000_000  # samples
-KEY = b"recordings"
-PLAIN = (
+METADATA_KEY = b"recordings"
+COPIED_FIELDS = (
     "name",
     "role",
     "axis",
@@ -63,16 +63,16 @@ def to_parquet(recordings: Sequence[Recording]) -> bytes:
     names = [n for n in TYPES if n == "time_ns" or any(n in columns for columns in stored)]
     entries = [
         {
-            **{name: getattr(r, name) for name in PLAIN},
+            **{name: getattr(r, name) for name in COPIED_FIELDS},
             "rows": r.samples,
             "columns": list(columns),
             "notes": [n.to_json() for n in r.notes],
         }
         for r, columns in zip(recordings, stored, strict=True)
     ]
-    description = {"schema_version": SCHEMA_VERSION, "recordings": entries}
+    description = {"schema_version": PARQUET_VERSION, "recordings": entries}
     text = json.dumps(description, separators=(",", ":"), default=_plain)
-    schema = pa.schema([(n, pa.type_for_alias(TYPES[n])) for n in names], metadata={KEY: text.encode()})
+    schema = pa.schema([(n, pa.type_for_alias(TYPES[n])) for n in names], metadata={METADATA_KEY: text.encode()})
     tables = [
         pa.Table.from_arrays(
             [
@@ -103,13 +103,13 @@ def from_parquet(content: bytes, name: str) -> list[Recording]:
     """
     # a file of some MB is read fastest by a single thread
     file = parquet.ParquetFile(pa.BufferReader(content), pre_buffer=False)
-    text = (file.schema_arrow.metadata or {}).get(KEY)
+    text = (file.schema_arrow.metadata or {}).get(METADATA_KEY)
     if text is None:
         raise InputError("holds no recordings: it was not written by ingest or filter", name)
     description = json.loads(text)
-    if description["schema_version"] != SCHEMA_VERSION:
+    if description["schema_version"] != PARQUET_VERSION:
         raise InputError(
-            f"schema_version {description['schema_version']} is not known to this version ({SCHEMA_VERSION}); "
+            f"schema_version {description['schema_version']} is not known to this version ({PARQUET_VERSION}); "
             "delete the results and run again",
             name,
         )
@@ -140,7 +140,7 @@ class _StoredRecording(Recording):
         """Return the recording of an entry of the file's description; ``read`` returns its columns."""
         recording = cls.__new__(cls)
         vars(recording).update(
-            {n: entry[n] for n in PLAIN},
+            {n: entry[n] for n in COPIED_FIELDS},
             time_ns=read(["time_ns"])[0],
             notes=tuple(map(Note.of, entry["notes"])),
             stored=lambda names: read(names) if names[0] in entry["columns"] else None,

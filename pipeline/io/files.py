@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 FILE = "{file}"
 UNIT_NAME = re.compile(r"[A-Za-z0-9._-]+")
 LONGEST_NAME = 200  # a file name has at most 255 bytes; files of a unit add up to 41 (_accelerometer_unknown.yaml)
-OF_STAGES = (".failed", ".noise", ".calibration")  # <unit>.failed.json and others are in the folder of <unit>.json
+STAGE_ENDINGS = (".failed", ".noise", ".calibration")  # <unit>.failed.json and others are in the folder of <unit>.json
 
 
 def recording_files(procedure: Procedure, ingest: Ingest, folder: Path) -> dict[str, list[Path]]:
@@ -88,5 +88,5 @@ def wrong_name(name: str) -> str:
         return "use letters, digits, '.', '_', '-'"
     if len(name) > LONGEST_NAME:
         return f"has {len(name)} characters; {LONGEST_NAME} is the limit, as file names are made of it"
-    ending = next((e for e in OF_STAGES if name.endswith(e)), "")
+    ending = next((e for e in STAGE_ENDINGS if name.endswith(e)), "")
     return f"a name cannot end in {ending}, which marks files of another kind" if ending else ""

@@ -262,7 +262,7 @@ LOW_COST_BIAS = {"accelerometer": 0.08 / 2.0, "gyroscope": 20.0 / 250.0}  # shar
 LOW_COST_SCALE, LOW_COST_CROSS = 0.03, 0.02  # see above
 EQUAL_SPREAD = 0.1  # relative spread of the three scale factors that have one cause
 FACTOR_DISTANCE = 0.03  # relative distance from a factor by which it is recognised, as a low-cost scale factor's limit
-FACTORS = {
+MISTAKEN_FACTORS = {
     "accelerometer": {
         9.80665: "in m/s^2, and read as g",
         1000.0: "in mg, and read as g",
@@ -277,14 +277,16 @@ FACTORS = {
 }
 NAMED_PARAMETERS = 5  # parameters beyond the limits that a line names
 RANGE_RATIOS = [2.0**n for n in range(-6, 7) if n]  # ratios of the ranges of one sensor: neighbours differ by two
-OF_BIAS = "an offset of raw counts that is not subtracted, another column, or a damaged axis"
+CAUSES_OF_BIAS = "an offset of raw counts that is not subtracted, another column, or a damaged axis"
 OF_CROSS_AXIS = "another column or axis map, or a unit that moved on the table between recordings"
 OF_FRAME = "the direction of the case"
 NO_FRAME = "how it lies in the body frame of turn axes, faces and zeros is not stated (table.seat_deg, procedure.faces)"
 OF_EFFECT = "another effect that looks alike, or an error of the table, its log or the time stamps"
 
 Entry = dict[str, Any]
-Row = tuple[str, float, float, str, float, float, str]  # name, value, uncertainty, unit, limit, floor, likely cause
+LimitRow = tuple[
+    str, float, float, str, float, float, str
+]  # name, value, uncertainty, unit, limit, floor, likely cause
 
 
 def implausible(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[Entry]:
@@ -317,12 +319,12 @@ def beyond_words(part: Mapping[str, Any] | None) -> str:
     return ", ".join(first([f"{_plain(e)} ({100.0 * e['ratio']:.3g} %)" for e in entries], NAMED_PARAMETERS))
 
 
-def _entry(row: Row) -> Entry:
+def _entry(row: LimitRow) -> Entry:
     name, value, _, unit, limit, *_ = row
     return {"parameter": name, "value": value, "unit": unit, "limit": limit, "ratio": abs(value) / limit}
 
 
-def _limited(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> Iterator[Row]:
+def _limited(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> Iterator[LimitRow]:
     """Yield the rows of all parameters that the sensor file limits."""
     yield from _of_bias_and_matrix(sensor, part, data_sheet)
     yield from limited_effects(sensor, part, data_sheet.effects)
@@ -335,14 +337,14 @@ def without_rotation(matrix: Values) -> Values:
     return np.asarray((axes * np.sqrt(squares)) @ axes.T)
 
 
-def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> Iterator[Row]:
+def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> Iterator[LimitRow]:
     """Yield the rows of biases, scale factors and cross-axis sensitivities."""
     K, P = np.linalg.inv(np.array(part["matrix"], float)), without_rotation(np.array(part["matrix"], float))
     spread = part["expanded_uncertainty"]
     of_matrix = np.abs(K) @ np.array(spread["matrix"], float) @ np.abs(K)  # dK = -K dM K
     floor, unit = LOW_COST_BIAS[sensor] * data_sheet.full_scale, SENSOR_UNITS[sensor]
     for name, value, uncertainty in zip(BIAS_NAMES, part["bias"], spread["bias"], strict=True):
-        yield name, float(value), float(uncertainty), unit, data_sheet.bias, floor, OF_BIAS
+        yield name, float(value), float(uncertainty), unit, data_sheet.bias, floor, CAUSES_OF_BIAS
     scale, limit = _scale_cause(sensor, np.diag(P)), data_sheet.scale_factor
     for i, a in enumerate(AXES):
         yield f"scale_factor_{a}", float(P[i, i] - 1.0), float(of_matrix[i, i]), "1", limit, LOW_COST_SCALE, scale
@@ -351,7 +353,7 @@ def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], data_sheet: DataSh
         yield name, float(P[i, j]), float(of_matrix[i, j]), "1", limit, LOW_COST_CROSS, OF_CROSS_AXIS
 
 
-def limited_effects(sensor: str, part: Mapping[str, Any], limits: Mapping[str, float]) -> Iterator[Row]:
+def limited_effects(sensor: str, part: Mapping[str, Any], limits: Mapping[str, float]) -> Iterator[LimitRow]:
     """Yield the rows of the effects' parameters that have an uncertainty and a limit; ``limits``: of the effects."""
     for entry in part.get("effects") or []:
         try:
@@ -371,7 +373,7 @@ def _scale_cause(sensor: str, factors: np.ndarray) -> str:
     mean = float(np.mean(factors))
     if np.ptp(factors) > EQUAL_SPREAD * mean:
         return "another column, counts per unit or axis map of this axis, or a damaged axis"
-    unit = next((u for f, u in FACTORS[sensor].items() if abs(mean / f - 1.0) < FACTOR_DISTANCE), None)
+    unit = next((u for f, u in MISTAKEN_FACTORS[sensor].items() if abs(mean / f - 1.0) < FACTOR_DISTANCE), None)
     if unit is not None:
         return f"readings {mean:.4g} times the truth: they are {unit}; set the unit of their columns in ingest"
     setting = f"set sensor.{sensor}.full_scale and counts_per_unit"

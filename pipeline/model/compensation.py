@@ -24,7 +24,7 @@ from pipeline.errors import InputError
 from pipeline.model.calibration_file import read_calibration, sample_covariance, sensor_of
 from pipeline.model.effects import load_python_effect, register
 from pipeline.model.effects.base import OF_THE_ROOM
-from pipeline.model.log_motion import SIGNALS, ExponentialRegression, LogEnd, fields_used, log_motion
+from pipeline.model.log_motion import FIELDS_OF_SIGNALS, ExponentialRegression, LogEnd, fields_used, log_motion
 from pipeline.model.measurement import SensorEffects, sensor_effects, solve, without_effects
 from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration, Values
 
@@ -73,7 +73,7 @@ class Steps:
 
     def needs(self, effect: str) -> set[str]:
         """Return the signals of a log that an effect needs."""
-        return set().union(*(SIGNALS[field] for field in self.fields[effect]))
+        return set().union(*(FIELDS_OF_SIGNALS[field] for field in self.fields[effect]))
 
 
 def circular(steps: Mapping[str, Steps]) -> set[str]:

@@ -103,7 +103,7 @@ OPERATORS: dict[type[ast.operator], tuple[Callable[..., Any], str]] = {
     ast.Mult: (np.multiply, "*"),
     ast.Div: (np.divide, "/"),
 }
-POWERS: dict[float, tuple[Callable[..., Any], str, str]] = {  # in C of a name, and of what is longer
+POWER_FUNCTIONS: dict[float, tuple[Callable[..., Any], str, str]] = {  # in C of a name, and of what is longer
     2.0: (np.square, "({0} * {0})", "imu_square({0})"),
     3.0: (lambda x: x * x * x, "({0} * {0} * {0})", "imu_cube({0})"),
 }
@@ -241,10 +241,10 @@ class _Reader:
     def _power(self, node: ast.BinOp, depth: int) -> tuple[Evaluate, str]:
         base, c_base = self.read(node.left, depth + 1)
         exponent = self._exponent(node.right)
-        if exponent not in POWERS:
+        if exponent not in POWER_FUNCTIONS:
             power = _applied(np.power, base, _number(exponent)[0])
             return power, f"(imu_real)pow({c_base}, {c_number(exponent)})"
-        function, short, c = POWERS[exponent]
+        function, short, c = POWER_FUNCTIONS[exponent]
         return _applied(function, base), (short if SIMPLE_IN_C.fullmatch(c_base) else c).format(c_base)
 
     def _exponent(self, node: ast.expr) -> float:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 STRETCH = 4.0  # memories: exp(4) costs two digits of the sums; shorter stretches cost time
 MAX_MEMORIES_BACK = 50.0  # memories that time may go back: exp(50) of the sums is still far from overflow
 DEGENERATE = 1e-15  # determinant over its scale, below which doubles do not resolve a slope
-SIGNALS = {
+FIELDS_OF_SIGNALS = {
     "time": {"time"},
     "temperature": {"temperature"},
     "specific_force": {"accelerometer"},
@@ -114,7 +114,7 @@ def fields_used(sensor: str, effects: Iterable[FittedEffect]) -> set[str]:
     for fitted in effects:
         looked_at = effect_of(fitted).fields(sensor, fitted.values)
         seen |= looked_at
-        strange = sorted(looked_at - set(SIGNALS))
+        strange = sorted(looked_at - set(FIELDS_OF_SIGNALS))
         if strange:
             raise ConfigurationError(
                 f"effect {fitted.name} needs {', '.join(strange)}, which a field log does not hold"

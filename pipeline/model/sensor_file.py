@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from pipeline.settings import DataSheet, Sensor
 
-NEEDED = ("noise_density", "bias_wander", "wander_time_s", "bias", "scale_factor", "cross_axis", "effects")
+REQUIRED_FIGURES = ("noise_density", "bias_wander", "wander_time_s", "bias", "scale_factor", "cross_axis", "effects")
 
 
 def completed(sensor: Mapping[str, Any], generic: Mapping[str, Any]) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def completed(sensor: Mapping[str, Any], generic: Mapping[str, Any]) -> dict[str
     out = dict(sensor)
     for part in SENSORS:
         data_sheet = dict(sensor.get(part) or {k: generic[part][k] for k in ("full_scale", "counts_per_unit")})
-        missing = [key for key in NEEDED if data_sheet.get(key) is None]
+        missing = [key for key in REQUIRED_FIGURES if data_sheet.get(key) is None]
         if missing:
             out[part] = data_sheet | {key: generic[part][key] for key in missing} | {"assumed": missing}
     return out

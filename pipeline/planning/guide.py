@@ -50,7 +50,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.accelerometer.nonlinear_least_squares import COLUMNS, IDEAL, PLACE, ROWS, triangle
+from pipeline.estimation.accelerometer.nonlinear_least_squares import IDEAL, LOWER_COLUMNS, LOWER_ROWS, PLACE, triangle
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, limit_of_misalignment
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
 from pipeline.estimation.multi_position.moves import sound_span
@@ -186,7 +186,7 @@ def progress_of(unit: UnitState, settings: Settings, dwell: float) -> GuideProgr
     rests, white = orientations.rests, _white_of_rest(orientations, data_sheet, dwell)
     error = float(np.hypot(white, scatter))
     u = {True: 0.5 * data_sheet.scale_factor, False: limit_of_misalignment(data_sheet)}
-    of_matrix = [u[bool(i == j)] for i, j in zip(ROWS, COLUMNS, strict=True)]
+    of_matrix = [u[bool(i == j)] for i, j in zip(LOWER_ROWS, LOWER_COLUMNS, strict=True)]
     F = np.diag(1.0 / np.square([0.5 * data_sheet.bias / gravity] * 3 + of_matrix))  # P
     if len(rests.time):
         J = derivative_of(rests.reading, values)
@@ -243,7 +243,7 @@ def derivative_of(y: Values, values: Values) -> Values:
     L, centred = triangle(values), y - values[BIAS]
     u = centred @ L.T
     n = u / np.linalg.norm(u, axis=1, keepdims=True)
-    return np.concatenate([-n @ L, n[:, ROWS] * centred[:, COLUMNS]], axis=1)
+    return np.concatenate([-n @ L, n[:, LOWER_ROWS] * centred[:, LOWER_COLUMNS]], axis=1)
 
 
 def _undetermined(fitted: SensorCalibration) -> str:

@@ -54,7 +54,10 @@ MIN_SAMPLES_OF_REST, MIN_RESTS_OF_SCATTER = 8, 3
 LOUDER = 4.0  # the scatter of 16 samples of white noise is so large in fewer than 1 of 10^9 blocks
 # quartile of a normal distribution; factor and limit of s
 QUARTER_SIZE, UNUSUAL, MAX_SCATTER_DEVIATION = 0.6745, 5.0, 0.4
-OF_RESTS, OF_SHEET = 2.0, 4.0  # a running bench adds noise to that on a desk; data sheets state typical noise
+MAX_TIMES_RESTS, MAX_TIMES_DATA_SHEET = (
+    2.0,
+    4.0,
+)  # a running bench adds noise to that on a desk; data sheets state typical noise
 STEPPED_DEG = 0.1  # between two samples of a rest: five times what RATE_AT_REST_DPS turns in a second
 SIGNIFICANT_DEVIATIONS_AT_REST = 6.0  # standard deviations, as in pipeline.signal.rests
 MIN_NOISE_SAMPLES_AT_REST = 60  # fewest that determine the noise in pipeline.estimation.noise
@@ -63,7 +66,7 @@ UNKNOWN_DEGC = 5.0  # change of temperature in some minutes of a room, where non
 HALF_TURN_DEG = 180.0  # in which both axes across a level turn vary by 1 g at least
 SPANNED = 0.2  # of what the motion requires
 INNER = (0.05, 0.95)  # shares of the samples
-COPIED = 0.5  # share of the changes of an axis that another makes at the same row, to the last digit
+MIN_COPIED_SHARE = 0.5  # share of the changes of an axis that another makes at the same row, to the last digit
 LEVEL_G = 0.5  # of the axes across a turn together, from which gravity turns in the body
 MIN_AXIS_SAMPLES = 32  # samples, of which an axis is copied or stays
 
@@ -121,12 +124,12 @@ def _doubted(
         static, usual = median(_moments(blocks)), median(rests)
         louder = float(np.max(static[0] / np.maximum(usual[0], step)))
         quieter = float(np.min(usual[1] / np.maximum(static[1], step)))
-        if louder > OF_RESTS * faster:
+        if louder > MAX_TIMES_RESTS * faster:
             details.append(
                 f"the {sensor} scatters {louder:.3g} times as much as in the rests of the other recordings; "
                 "its noise would be used for all of them"
             )
-        elif quieter > OF_RESTS * slower:
+        elif quieter > MAX_TIMES_RESTS * slower:
             details.append(
                 f"the {sensor} has at most {1.0 / quieter:.2g} times the white noise of the rests of the other "
                 "recordings: if the recording is of another unit, the noise of this one is underestimated"
@@ -225,9 +228,9 @@ def _moving(
     louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * spread))
     white = data_sheet.noise_density * np.sqrt(0.5 / recording.interval)
     if len(rests):
-        usual = np.minimum(usual, OF_RESTS * np.maximum(np.median(rests[:, 0], axis=0), white))
+        usual = np.minimum(usual, MAX_TIMES_RESTS * np.maximum(np.median(rests[:, 0], axis=0), white))
     elif white:
-        usual = np.minimum(usual, OF_SHEET * white)
+        usual = np.minimum(usual, MAX_TIMES_DATA_SHEET * white)
     usual = np.maximum(usual, 0.5 * _digit(blocks.reshape(-1, 3)))
     loud = scatter / usual
     away = np.abs(means - median(means))
@@ -317,12 +320,14 @@ def _check_copies(recording: Recording) -> None:
         if reading is None:
             continue
         a, b = reading[:, one], reading[:, two]
-        if np.count_nonzero(np.abs(a) == np.abs(b)) <= COPIED * MIN_AXIS_SAMPLES:  # in any rows: too few for a refusal
+        if (
+            np.count_nonzero(np.abs(a) == np.abs(b)) <= MIN_COPIED_SHARE * MIN_AXIS_SAMPLES
+        ):  # in any rows: too few for a refusal
             continue
         changing = a[1:] != a[:-1]
         if changing.sum() < MIN_AXIS_SAMPLES:
             continue
-        least = max(COPIED, SIGNIFICANT_DEVIATIONS_AT_REST * float(np.sqrt(0.5 / changing.sum())))
+        least = max(MIN_COPIED_SHARE, SIGNIFICANT_DEVIATIONS_AT_REST * float(np.sqrt(0.5 / changing.sum())))
         for sign, what in ((1.0, "a copy"), (-1.0, "the negative")):
             same, by_chance = ((a[1:] == sign * other)[changing] for other in (b[1:], b[:-1]))
             if same.mean() - by_chance.mean() > least:

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 RATIO_BLOCKS = 96  # of a recording, so that each holds a part of a turn
 GRAVITY_TOLERANCE = 0.2  # of a ratio to the angle by gravity: two times 6 deg in 60
 WRONG_FACTORS = ((0.5, "is half of what it should be"), (2.0, "is twice what it should be"))
-UNITS = (
+UNIT_MISTAKES = (
     (np.pi / 180.0, "looks like rad/s declared as deg/s"),
     (180.0 / np.pi, "looks like deg/s declared as rad/s"),
     (1.0 / 6.0, "looks like rpm declared as deg/s"),
@@ -373,7 +373,7 @@ def _wrong_rate(
     if gyro_agrees and ratio.of_time:
         return _wrong_time(recording, limits, ratio, "the table's rate sums up to")
     name, keys = limits.column(recording, "table_rate"), "ingest.csv.columns.table_rate.unit"
-    what = _unit(ratio.value, UNITS) or f"is {ratio.value:.4g} times what it should be"
+    what = _unit(ratio.value, UNIT_MISTAKES) or f"is {ratio.value:.4g} times what it should be"
     if gyro_agrees and what.startswith("looks"):
         keys += " and those of gyro_x, gyro_y, gyro_z"
         name, what = f"{name} and {limits.column(recording, 'gyroscope')}", what.replace("looks", "look", 1)

@@ -51,7 +51,7 @@ CLEAR_CHI_SQUARE, OF_TWO_MORE = 1.0, 4.0
 MAX_SEAT_CHI_SQUARE = 33.0  # chi-square of at most 13 degrees of freedom with a probability of 0.002
 GAUGE = 1e-6  # weight with which the seats have the smallest sum of squares
 # Columns of the design of ``_fit``: K comes before the bias.
-OF_K, OF_BIAS = slice(0, len(MATRIX_NAMES)), slice(len(MATRIX_NAMES), BASE_COUNT)
+K_COLUMNS, BIAS_COLUMNS = slice(0, len(MATRIX_NAMES)), slice(len(MATRIX_NAMES), BASE_COUNT)
 QUARTER_TURNS_DEG = np.array([0.0, 90.0, 180.0, 270.0])
 TABLE_EFFECTS = ("table_tilt", "table_axis_nonorthogonality")
 # Largest plausible tilt (deg), lean (deg) and time offset (s) where the sensor's config states none.
@@ -159,8 +159,8 @@ def _fit(turns: Sequence[_Conventional], K: Values, columns: Values, limits: Seq
     """
     design = np.zeros((*columns.shape[:3], BASE_COUNT + columns.shape[3]))
     for k, turn in enumerate(turns):
-        design[k, 1:, :, OF_K] = [np.kron(np.eye(3), ideal) for ideal in turn.ideal]
-    design[:, 0, :, OF_BIAS] = np.eye(3)
+        design[k, 1:, :, K_COLUMNS] = [np.kron(np.eye(3), ideal) for ideal in turn.ideal]
+    design[:, 0, :, BIAS_COLUMNS] = np.eye(3)
     design[..., AFTER_BASE] = K @ columns
     weight = 1.0 / np.array([[NOISE_C_G], [NOISE_PQ_G], [NOISE_PQ_G]])
     A = (weight[..., None] * design).reshape(9 * len(turns), -1)

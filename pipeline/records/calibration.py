@@ -13,7 +13,7 @@ import numpy as np
 
 from imu_logs.units import SENSOR_UNITS
 from pipeline.records.budget import LIMIT, Budget, BudgetLine, finite, unlimited
-from pipeline.records.correction import Step, published, steps_of
+from pipeline.records.correction import CorrectionStep, published, steps_of
 from pipeline.records.parameters import (
     BASE,
     BASE_NAMES,
@@ -43,7 +43,9 @@ class StageResult:
     name: str
     parameters: Mapping[str, Estimate] = field(default_factory=dict)
     residual_rms: float | None = None  # of the error that the fit minimises, after this stage, unit of the sensor
-    correction: tuple[Step, ...] | None = None  # of readings after this stage, if it is more than matrix and bias
+    correction: tuple[CorrectionStep, ...] | None = (
+        None  # of readings after this stage, if it is more than matrix and bias
+    )
     details: Mapping[str, Any] = field(default_factory=dict)  # for the report: condition number, samples, iterations
 
     def to_json(self) -> dict[str, Any]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from imu_logs.log import Values
 
-KINDS = "subtract, matrix, two_sided"
+STEP_KINDS = "subtract, matrix, two_sided"
 
 
 @dataclass(frozen=True)
@@ -74,15 +74,15 @@ class TwoSided:
         return {"two_sided": {name: value.tolist() for name, value in vars(self).items()}}
 
 
-Step: TypeAlias = Subtract | Multiply | TwoSided
+CorrectionStep: TypeAlias = Subtract | Multiply | TwoSided
 
 
-def steps_of(correction: Mapping[str, Any] | None) -> tuple[Step, ...] | None:
+def steps_of(correction: Mapping[str, Any] | None) -> tuple[CorrectionStep, ...] | None:
     """Return the steps of a published correction; raise ``ConfigurationError`` if one is of an unknown kind."""
     return None if correction is None else tuple(_step(entry) for entry in correction["steps"])
 
 
-def _step(entry: Mapping[str, Any]) -> Step:
+def _step(entry: Mapping[str, Any]) -> CorrectionStep:
     match dict(entry):
         case {"subtract": offset}:
             return Subtract(np.asarray(offset, float))
@@ -90,15 +90,15 @@ def _step(entry: Mapping[str, Any]) -> Step:
             return Multiply(np.asarray(matrix, float))
         case {"two_sided": sides}:
             return TwoSided(*(np.asarray(sides[name], float) for name in ("positive", "negative", "switch_at")))
-    raise ConfigurationError(f"a correction has a step {sorted(entry)}; known kinds are {KINDS}")
+    raise ConfigurationError(f"a correction has a step {sorted(entry)}; known kinds are {STEP_KINDS}")
 
 
-def published(steps: Sequence[Step]) -> dict[str, Any]:
+def published(steps: Sequence[CorrectionStep]) -> dict[str, Any]:
     """Return the published correction."""
     return {"steps": [step.to_json() for step in steps]}
 
 
-def corrected(steps: Sequence[Step], readings: Values) -> Values:
+def corrected(steps: Sequence[CorrectionStep], readings: Values) -> Values:
     """Return (n, 3) readings, g or deg/s, after the steps of a correction."""
     out = np.array(readings, float)
     for step in steps:

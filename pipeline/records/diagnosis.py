@@ -97,7 +97,7 @@ class RankedFormula:
 
 
 @dataclass(frozen=True)
-class HeldOutErrors:
+class SelectionErrors:
     """The held-out rms error without and with the selected effects, and the noise floor, g or deg/s."""
 
     error_before: float
@@ -109,7 +109,7 @@ class HeldOutErrors:
 class TableEvidence:
     """Evidence that turns on a table alone give."""
 
-    held_out: HeldOutErrors | None  # None: no effect was selected, or no motion is held out
+    held_out: SelectionErrors | None  # None: no effect was selected, or no motion is held out
     formulas: Sequence[RankedFormula]
     not_suggested: str | None = None  # why the first formula is not offered as an effect
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from imu_logs.log import Integers, Mask, Note, Values
 
-Quantity = TypeVar("Quantity")
+ReturnedQuantity = TypeVar("ReturnedQuantity")
 Arguments = ParamSpec("Arguments")
 
 NANOSECONDS = 1_000_000_000
@@ -143,8 +143,8 @@ class Recording:
 
 
 def once(
-    compute: Callable[Concatenate[Recording, Arguments], Quantity],
-) -> Callable[Concatenate[Recording, Arguments], Quantity]:
+    compute: Callable[Concatenate[Recording, Arguments], ReturnedQuantity],
+) -> Callable[Concatenate[Recording, Arguments], ReturnedQuantity]:
     """Declare a quantity of a recording: it follows from the recording and further arguments, which have a hash.
 
     The function computes it at the first call, and the recording keeps it. The steps of a unit pass on its recordings
@@ -155,22 +155,22 @@ def once(
 
 
 def once_of_log(
-    compute: Callable[Concatenate[Recording, Arguments], Quantity],
-) -> Callable[Concatenate[Recording, Arguments], Quantity]:
+    compute: Callable[Concatenate[Recording, Arguments], ReturnedQuantity],
+) -> Callable[Concatenate[Recording, Arguments], ReturnedQuantity]:
     """Declare a quantity as ``once`` that depends on no readings, flags, filter or role (``with_readings``)."""
     return _kept(compute, lambda recording: recording._quantities_of_log)  # noqa: SLF001
 
 
 def _kept(
-    compute: Callable[Concatenate[Recording, Arguments], Quantity],
+    compute: Callable[Concatenate[Recording, Arguments], ReturnedQuantity],
     quantities: Callable[[Recording], dict[Hashable, Any]],
-) -> Callable[Concatenate[Recording, Arguments], Quantity]:
+) -> Callable[Concatenate[Recording, Arguments], ReturnedQuantity]:
     @wraps(compute)
-    def quantity(recording: Recording, /, *arguments: Arguments.args, **named: Arguments.kwargs) -> Quantity:
+    def quantity(recording: Recording, /, *arguments: Arguments.args, **named: Arguments.kwargs) -> ReturnedQuantity:
         known, key = quantities(recording), (quantity, arguments, *sorted(named.items()))
         if key not in known:
             known[key] = quantity.__wrapped__(recording, *arguments, **named)
-        found: Quantity = known[key]
+        found: ReturnedQuantity = known[key]
         return found
 
     return quantity

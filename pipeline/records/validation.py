@@ -143,11 +143,11 @@ class SensorValidation:
             over_temperature=over
             and OverTemperature(over["samples_of"], tuple(TemperatureBin(**each) for each in over["bins"])),
             limits=tuple(LimitCheck(c["name"], c["limit"], c["value"], c["pass"]) for c in data["limits"]),
-            **{key: data[key] for key in COPIED},
+            **{key: data[key] for key in KEYS_AS_THEY_ARE},
         )
 
 
-COPIED = (
+KEYS_AS_THEY_ARE = (
     "unit", "held_out", "reason", "samples", "noise_floor", "vector_noise_floor", "reference_rms", "worse_than_raw",
 )  # fmt: skip
 

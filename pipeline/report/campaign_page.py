@@ -15,18 +15,19 @@ import pandas as pd
 
 from pipeline.outcome import all_well, beyond_limits_groups, command_of, counts_of, explain_command, ratio_words
 from pipeline.records import SENSOR_UNITS, SENSORS, Index, Values
-from pipeline.report.chart import Area, Dots, Figure, Layer, LineMark, Panel, chart, sentences
+from pipeline.report.chart import Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
 from pipeline.report.fleet import parameter_table, wide
 from pipeline.report.numbers import Scale, number, percent, plain, scale_of, unit_text
 from pipeline.report.pages import script_data, template
-from pipeline.report.parameters import COLUMNS
+from pipeline.report.parameters import SUMMARY_COLUMNS
 from pipeline.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, error_in_row, kinds_of, problems
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
+    from pipeline.files import JSON
 
-JSON = dict[str, Any]
+
 UnitChart = tuple[Figure, dict[str, list[str]]]  # a chart of units, and the text of each dot by its colour
 FIRST_ROWS = 100  # rows in the page; the script adds the others when they come into view
 NAMED_UNITS = 3  # units that the finding of a chart names
@@ -64,7 +65,9 @@ def render(
     """
     settings, found = settings or {"campaign": campaign}, problems(rows)
     devices = {row.get("serial") or row["unit"] for row in rows}
-    frame = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))
+    frame = pd.DataFrame(rows).reindex(
+        columns=list(dict.fromkeys([*SUMMARY_COLUMNS, *(k for row in rows for k in row)]))
+    )
     judged = [row.get("pass") for row in rows]
     serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
     fleet = [unit_chart for sensor in SENSORS if (unit_chart := _fleet_figure(sensor, frame))]
@@ -118,7 +121,7 @@ def render(
         verdicts={verdict: verdict.css_class for verdict in Verdict},
         sensors=[s for s in SENSORS if frame[f"{s}_error_after"].notna().any()] or SENSORS,
         scales={s: _scale(s, rows) for s in SENSORS},
-        kept=sorted(set(frame) - set(COLUMNS)),
+        kept=sorted(set(frame) - set(SUMMARY_COLUMNS)),
         page=page,
     )
     return text
@@ -148,7 +151,7 @@ def overview_chart(sensor: str, rows: Sequence[JSON]) -> UnitChart | None:
         edges = np.linspace(np.log10(min(ratio.min(), 1.0)), np.log10(max(ratio.max(), 3.0)) + 1e-9, HISTOGRAM_BINS + 1)
         counts = np.array([np.histogram(np.log10(ratio[of]), edges)[0] for of, *_ in states], float)
         tops = np.cumsum(counts, axis=0)
-        layers: list[Layer] = []
+        layers: list[ChartLayer] = []
         for low, high, (of, colour, _) in zip([np.zeros(HISTOGRAM_BINS), tops[0]], tops, states, strict=True):
             if of.any():
                 layers.append(Area(np.repeat(low, 2), np.repeat(high, 2), colour, 10.0 ** np.repeat(edges, 2)[1:-1]))
@@ -236,7 +239,7 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> UnitChart | None:
     first, last = (before, order > 0, 3, "before"), (floor, order > 0, 4, "noise floor")  # the floor on top of the dots
     judged = [(after, complete, 2, "after, nothing missing"), (after, known & ~complete, 0, "after, any other verdict")]
     dotted = [first, *judged, last]
-    layers: list[Layer] = []
+    layers: list[ChartLayer] = []
     legend, values = [], {}
     drawn = known
     if many:
@@ -282,7 +285,7 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> UnitChart | None:
     return figure, values
 
 
-def _quantiles(order: np.ndarray, values: np.ndarray, colour: int) -> list[Layer]:
+def _quantiles(order: np.ndarray, values: np.ndarray, colour: int) -> list[ChartLayer]:
     """Return the median and the band from 5 to 95 % of neighbouring units."""
     parts = [p for p in np.array_split(np.arange(len(order)), QUANTILE_PARTS) if np.isfinite(values[p]).any()]
     low, middle, high = np.array([np.nanquantile(values[p], [0.05, 0.5, 0.95]) for p in parts]).reshape(-1, 3).T
@@ -338,7 +341,7 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
         ends = np.nanquantile(share, [0.05, 0.95], axis=0).T
         layers += [_bar(each, row - HALF_BAR, row + HALF_BAR, 3) for row, each in zip(height, ends, strict=True)]
     beyond, values, legend = marked == 1.0, {}, []
-    dots: list[Layer] = []
+    dots: list[ChartLayer] = []
     for chosen, colour, words in ((drawn & ~beyond, 2, "within the limit"), (drawn & beyond, 0, "beyond the limit")):
         i, j = np.nonzero(chosen)
         if len(i):
@@ -368,5 +371,5 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
     return chart(figure, description, [panel], label, margin=0.03, left=LEFT, units="units"), values
 
 
-def _bar(ends: Values, low: float, high: float, colour: int) -> Layer:
+def _bar(ends: Values, low: float, high: float, colour: int) -> ChartLayer:
     return Area(low, high, colour, 100.0 * np.clip(ends, -MAX_DRAWN_SHARE, MAX_DRAWN_SHARE))

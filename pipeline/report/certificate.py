@@ -32,10 +32,10 @@ from pipeline.verdicts import KINDS, Verdict, error_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from pipeline.files import JSON
     from pipeline.report.parameters import Parameter
     from pipeline.settings import Certificate, Settings
 
-JSON = dict[str, Any]
 STAMP = "NOT A CALIBRATION CERTIFICATE - incomplete: "
 ONLY_THIS_ITEM = "The results relate only to the item calibrated."
 COVERAGE = (
@@ -46,7 +46,7 @@ REPRODUCTION = "This report may be reproduced in full only, unless the laborator
 NOT_ADJUSTED = "Nothing was adjusted in the item: as found are its readings, as left those with this calibration."
 SOFTWARE_SAYS = "Accreditation and traceability are the laboratory's statements; the software asserts neither."
 DAY = re.compile(r"\d{4}-\d{2}-\d{2}")
-ERRORS = ("rms_error", "mean_abs_error", "max_error", "min_error", "vector_rms_error")
+CERTIFIED_ERRORS = ("rms_error", "mean_abs_error", "max_error", "min_error", "vector_rms_error")
 ASKED = (
     ("name of the laboratory", "7.8.2.1 b", "certificate.laboratory.name"),
     ("address of the laboratory", "7.8.2.1 b", "certificate.laboratory.address"),
@@ -192,8 +192,8 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: Settings, 
         "beyondLimits": part.get("beyond_limits") or [],
         "notDetermined": part.get("not_determined") or None,
         "uncertaintyBudget": part.get("uncertainty_budget"),
-        "beforeAdjustment": {k: first.get(k) for k in ERRORS} if first else None,
-        "afterAdjustment": {k: last.get(k) for k in ERRORS} if last else None,
+        "beforeAdjustment": {k: first.get(k) for k in CERTIFIED_ERRORS} if first else None,
+        "afterAdjustment": {k: last.get(k) for k in CERTIFIED_ERRORS} if last else None,
         "noiseFloor": held_out.get("noise_floor"),
         "residualsOverTemperature": held_out.get("over_temperature"),
         "conformity": {
@@ -292,7 +292,7 @@ def certificate_page(unit: str, report: JSON) -> str:
 DEMANDED = {"certificate.country": "countryCodeISO3166_1"}
 PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")  # of performance, by the schema
 # Units of this product: factor to the SI, and powers of the units of D-SI (D-SI 2.1.0, BIPM SI brochure, table 8: deg).
-UNITS: dict[str, tuple[float, dict[str, int]]] = {
+SI_UNITS: dict[str, tuple[float, dict[str, int]]] = {
     "1": (1.0, {}),
     "ppm": (1e-6, {}),
     "g": (9.80665, {"metre": 1, "second": -2}),
@@ -301,7 +301,7 @@ UNITS: dict[str, tuple[float, dict[str, int]]] = {
     "m": (1.0, {"metre": 1}),
     "degC": (1.0, {"kelvin": 1}),  # in slopes: a difference
 }
-TOKEN = re.compile(r"(\([^()]*\)|[^/()^]+)(?:\^(\d+))?")
+UNIT_TOKEN = re.compile(r"(\([^()]*\)|[^/()^]+)(?:\^(\d+))?")
 
 
 def missing_for_dcc(report: JSON) -> list[str]:
@@ -342,8 +342,8 @@ def dsi_unit(unit: str) -> tuple[float, str] | None:
 
 def _powers(unit: str) -> tuple[float, dict[str, int]] | None:
     factor, powers = 1.0, dict[str, int]()
-    for i, (token, exponent) in enumerate(TOKEN.findall(unit)):
-        base = _powers(token[1:-1]) if token.startswith("(") else UNITS.get(token)
+    for i, (token, exponent) in enumerate(UNIT_TOKEN.findall(unit)):
+        base = _powers(token[1:-1]) if token.startswith("(") else SI_UNITS.get(token)
         if base is None:
             return None
         n = int(exponent or 1) * (-1 if i else 1)

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from pipeline.report.axis import Tick
 
 AXES_LEGEND = (("c0", "x"), ("c1", "y"), ("c2", "z"))
-WIDTH = 420  # px, of the drawing; the page scales it
-LEFT, RIGHT, TOP, BOTTOM, GAP = 64, 14, 8, 36, 14  # px, margins of the panels and the gap between two
+CHART_WIDTH = 420  # px, of the drawing; the page scales it
+LEFT, RIGHT, TOP, BOTTOM, PANEL_GAP = 64, 14, 8, 36, 14  # px, margins of the panels and the gap between two
 UPRIGHT = 28  # px, of height for each tick of axis y
 MAXIMUM_DOTS = 240  # samples drawn as dots; about one in 1.4 px
 BUCKETS = 140  # ranges drawn for more samples; about one in 2.4 px
@@ -63,7 +63,7 @@ class Figure:
         """Return the figure with drawn content as its ``svg`` element; the description is for screen readers."""
         name, finding = escape(self.name), typeset(self.finding)
         svg = Markup(  # noqa: S704  (every text in it is escaped where it is written)
-            f'<svg class="chart" viewBox="0 0 {WIDTH} {height:g}" role="img" aria-labelledby="{name}-t {name}-d"'
+            f'<svg class="chart" viewBox="0 0 {CHART_WIDTH} {height:g}" role="img" aria-labelledby="{name}-t {name}-d"'
             f'{attributes}><title id="{name}-t">{escape(finding)}</title>'
             f'<desc id="{name}-d">{escape(typeset(description))}</desc>{content}</svg>'
         )
@@ -125,7 +125,7 @@ class Area:
     x: Values | None = None
 
 
-Layer = LineMark | SampleMarks | Dots | Area
+ChartLayer = LineMark | SampleMarks | Dots | Area
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class Panel:
     ``names``: x, y and text of points, left out where texts would overlap; ``rows``: names of y = 1, 2, ...
     """
 
-    layers: list[Layer]
+    layers: list[ChartLayer]
     label: str
     height: int = 140
     levels: Mapping[str, float] | None = None
@@ -166,21 +166,21 @@ def chart(
     the units.
     """
     values = {id(layer.x): layer.x for p in panels for layer in p.layers if layer.x is not None}
-    x = Axis.over(values.values(), left, WIDTH - RIGHT, kind, margin)
+    x = Axis.over(values.values(), left, CHART_WIDTH - RIGHT, kind, margin)
     ticks = x.ticks(6, columns)
     parts, top = [], float(TOP)
     for panel in panels:
         parts.append(_panel(panel, x, ticks, top))
-        top += panel.height + GAP
-    labels = "".join(text(at, top - GAP + 13, label, "m") for at, label in ticks)
+        top += panel.height + PANEL_GAP
+    labels = "".join(text(at, top - PANEL_GAP + 13, label, "m") for at, label in ticks)
     parts.append(f'<g class="ticks">{labels}</g>')
-    parts.append(text((x.start + x.stop) / 2, top - GAP + 28, x_label, "m"))
+    parts.append(text((x.start + x.stop) / 2, top - PANEL_GAP + 28, x_label, "m"))
     attributes = x.attribute(x_label, columns) + (f' data-names="{units}"' if units else "")
     long = [
         layer for p in panels for layer in p.layers if isinstance(layer, SampleMarks) and len(layer.x) > MAXIMUM_DOTS
     ]
     attributes += _full(long[0].x, long[0].x, x) if long else ""
-    return figure.drawn(description, top - GAP + BOTTOM, "".join(parts), attributes)
+    return figure.drawn(description, top - PANEL_GAP + BOTTOM, "".join(parts), attributes)
 
 
 def text(x: float, y: float, content: str, kind: str = "") -> str:
@@ -217,7 +217,7 @@ def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
     )
 
 
-def _draw(layer: Layer, x: Axis, y: Axis) -> str:
+def _draw(layer: ChartLayer, x: Axis, y: Axis) -> str:
     if isinstance(layer, Area):
         whole = (SUBDIVISION * np.array([x.start, x.stop])).astype(np.int64)
         at = whole if layer.x is None else x.units(layer.x)
@@ -303,7 +303,7 @@ def _names(points: Sequence[tuple[float, float, str]], x: Axis, y: Axis) -> str:
     out = []
     for px, py, name in points:
         width, left, base = LETTER * len(name), x.pixels(px) + 6.0, y.pixels(py) - 5.0
-        left = left if left + width <= WIDTH - 2 else x.pixels(px) - 6.0 - width
+        left = left if left + width <= CHART_WIDTH - 2 else x.pixels(px) - 6.0 - width
         if all(abs(base - b) > 11.0 or left > a + w or a > left + width for a, b, w in drawn):
             drawn.append((left, base, width))
             out.append(text(left, base, name, "b"))

@@ -36,7 +36,7 @@ import numpy as np
 
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.lot_prior import MIN_SIBLINGS, LotPrior, Prediction, lot_priors, with_prior
-from pipeline.estimation.uncertainty_budget import NOISE, own_and_bench
+from pipeline.estimation.uncertainty_budget import NOISE_SOURCE, own_and_bench
 from pipeline.estimation.uncertainty_budget import combined as budget_of
 from pipeline.io.files import wrong_name
 from pipeline.model.effects import owner_of
@@ -64,14 +64,15 @@ from pipeline.verdicts import Verdict
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from pipeline.files import JSON
 
-JSON = dict[str, Any]
+
 KIND = np.array([0, 0, 0, 1, 2, 2, 2, 1, 2, 2, 2, 1])  # of bias, diagonal and other elements of the matrix
-BENCH = "stated accuracies of the bench"
+STATED_ACCURACIES = "stated accuracies of the bench"
 EQUAL_SETTINGS = ("sensor", "method", "table")  # equal in the calibrations of one estimate
 LINE = "prior of the lot"
 LACK_OF_FIT = "lack of fit"  # errors of a table are part of it: siblings may have it in common
-SHARED = f"{BENCH}, and {LACK_OF_FIT}"
+SHARED_SOURCES = f"{STATED_ACCURACIES}, and {LACK_OF_FIT}"
 NO_VALUES = np.empty(0)
 MOST_FREEDOM = 1e12  # instead of infinitely many degrees of freedom, for which JSON has no number
 # U is too small
@@ -145,8 +146,8 @@ def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
     alone = scaled_inverse(np.sum([scaled_inverse(A) for A in by_readings], axis=0))
     scatter = np.where(r2 > 0.0, np.bincount(kind)[kind] * (len(x) - 1.0), np.inf)
     lines = [
-        Contribution(NOISE, "A", "Student's t", alone, freedom),
-        Contribution(BENCH, "B", NORMAL, np.mean(by_bench, axis=0), np.full(len(theta), np.inf)),
+        Contribution(NOISE_SOURCE, "A", "Student's t", alone, freedom),
+        Contribution(STATED_ACCURACIES, "B", NORMAL, np.mean(by_bench, axis=0), np.full(len(theta), np.inf)),
         Contribution("repeatability", "A", "Student's t", covariance - alone + np.diag(r2), scatter),
     ]
     result = StageResult("combined", {}, None, None, {"calibrations": len(each), "repeatability": np.sqrt(r2).tolist()})
@@ -366,9 +367,9 @@ def _sensor_with_prior(sensor: str, part: JSON, prior: UnitPrior) -> tuple[JSON,
     growth = np.divide(np.maximum(u, prior.shared), u, out=np.ones(len(u)), where=u > 0.0)
     remark = f"of {prior.lot}: mean and spread of {prior.siblings} siblings"
     lines = [
-        Contribution(NOISE, "A", "Student's t", found.own, freedom),
+        Contribution(NOISE_SOURCE, "A", "Student's t", found.own, freedom),
         Contribution(LINE, "A", "Student's t", found.lot, found.lot_freedom, remark=remark),
-        Contribution(SHARED, "B", NORMAL, shared * np.outer(growth, growth), of_shared),
+        Contribution(SHARED_SOURCES, "B", NORMAL, shared * np.outer(growth, growth), of_shared),
     ]
     stage = StageResult("lot_prior", {}, None, None, {"lot": prior.lot, "siblings": prior.siblings})
     after = with_values(replace(fit, stages=(*fit.stages, stage)), found.values, lines)

@@ -35,7 +35,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -52,10 +52,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-JSON = dict[str, Any]
+    from pipeline.files import JSON
+
 TEST_LEVEL = 0.05  # of a test, and 1 minus the coverage of an interval (JCGM 100:2008, 6.2.2: about 95 %)
 MEASURES = {"after": "rms error, held out", "truth": "rms error against the truth"}
-FIGURES = (
+FIGURE_COLUMNS = (
     "unit", "sensor", "before", "u_before", "after", "u_after", "truth", "u_truth", "noise_floor", "table_time",
     "verdict", "parameters",
 )  # fmt: skip
@@ -275,7 +276,7 @@ def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:
 
     ``figures``: ``unit_figures`` of all units, none of failed ones; ``name``: an identifier, unique on the page.
     """
-    frame = pd.DataFrame(list(figures), columns=list(FIGURES)).set_index("unit")
+    frame = pd.DataFrame(list(figures), columns=list(FIGURE_COLUMNS)).set_index("unit")
     against, pairs, sensors = comparison["against"], comparison["pairs"], []
     for sensor in comparison["sensors"]:
         known, unit = frame[frame["sensor"] == sensor], SENSOR_UNITS[sensor]

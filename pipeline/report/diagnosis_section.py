@@ -8,7 +8,7 @@ another shape. All points are the binned data of the diagnosis: nothing is fitte
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,16 +18,16 @@ from pipeline.estimation.posterior import prior_limit
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, parameter_limits
 from pipeline.records import AXES, SENSOR_UNITS, Values
-from pipeline.report.chart import Dots, Figure, Layer, LineMark, Panel, chart, sentences
+from pipeline.report.chart import ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import measured, number, percent, plain, unit_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.files import JSON
     from pipeline.settings import DataSheet
 
-JSON = dict[str, Any]
 RIVAL_SHARE = 0.8  # share of the selected effect's delta BIC above which another effect is named as a rival
 # effects and brackets that a chart or its caption shows
 MAX_CHART_EFFECTS, MIN_CHART_EFFECTS, MOST_HIDDEN, MAX_CAPTION_BRACKETS = 9, 3, 6, 2
@@ -237,7 +237,7 @@ def unexplained(sensor: str, found: JSON) -> list[Figure]:
         unit, covariate, panels, scatter = shown["unit"], shown["covariate"], [], []
         for panel in shown["panels"]:
             x, mean, error = _points(panel)
-            layers: list[Layer] = [_binned(panel)]
+            layers: list[ChartLayer] = [_binned(panel)]
             if "curve" in panel:
                 curve_x, curve = (np.array(panel[key], float) for key in ("curve_x", "curve"))
                 layers.insert(0, LineMark(curve_x, curve, 5, "model"))

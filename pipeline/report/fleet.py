@@ -33,15 +33,14 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.files import spreadsheet_cell, write_atomically
+from pipeline.files import JSON, spreadsheet_cell, write_atomically
 from pipeline.records import MEDIAN_SIZE, SENSORS
-from pipeline.report.parameters import COLUMNS, PARAMETERS
+from pipeline.report.parameters import PARAMETER_KEYS, SUMMARY_COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-JSON = dict[str, Any]
 # units, below which a median absolute deviation is too uncertain: its standard deviation is 17 % of it
 MIN_UNITS_OF_DEVIATION = 20
 OUTLIER_DEVIATIONS = 6.0  # robust standard deviations, which noise does not exceed in 10,000 units with 24 parameters
@@ -52,10 +51,10 @@ SIBLINGS = ["sensor", "method"]
 
 
 def parameter_table(units: Mapping[str, Sequence[Sequence[Any]]]) -> pd.DataFrame:
-    """Return the parameters of some units (``unit_parameters``) as one table: ``unit`` and ``PARAMETERS``."""
+    """Return the parameters of some units (``unit_parameters``) as one table: ``unit`` and ``PARAMETER_KEYS``."""
     rows = [(unit, *row) for unit, of_unit in units.items() for row in of_unit]
     kinds = dict.fromkeys(("value", "u", "U", "limit"), float) | {"beyond": bool, "fitted": bool}
-    return pd.DataFrame(rows, columns=["unit", *PARAMETERS]).astype(kinds)
+    return pd.DataFrame(rows, columns=["unit", *PARAMETER_KEYS]).astype(kinds)
 
 
 def wide(parameters: pd.DataFrame, units: Sequence[str], name: str, *figures: str) -> list[pd.DataFrame]:
@@ -224,7 +223,7 @@ def write_summary(path: Path, rows: list[JSON]) -> None:
 
     Texts of the user that a spreadsheet would take as a formula are escaped.
     """
-    columns = list(dict.fromkeys([*COLUMNS, *(key for row in rows for key in row)]))
+    columns = list(dict.fromkeys([*SUMMARY_COLUMNS, *(key for row in rows for key in row)]))
     frame = pd.DataFrame([{key: _cell(value) for key, value in row.items()} for row in rows], columns=columns)
     frame.columns = frame.columns.map(spreadsheet_cell)
     write_atomically(path, frame.to_csv(index=False, lineterminator="\n"))

@@ -14,7 +14,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.report.axis import LINEAR_TO, Axis
-from pipeline.report.chart import LETTER, WIDTH, Dots, Figure, Layer, LineMark, Panel, SampleMarks, chart, text
+from pipeline.report.chart import (
+    CHART_WIDTH,
+    LETTER,
+    ChartLayer,
+    Dots,
+    Figure,
+    LineMark,
+    Panel,
+    SampleMarks,
+    chart,
+    text,
+)
 from pipeline.report.numbers import number
 
 if TYPE_CHECKING:
@@ -70,7 +81,7 @@ def bars(
     else:
         positive = [v for v in (*values, *levels.values()) if v > 0] or [0.1, 1.0]
         ends = [min(positive) / (1.1 if means else 2.0), max(positive) * 1.15]
-    stop = WIDTH - (26 if means else RIGHT) - BRACKET * len(brackets)
+    stop = CHART_WIDTH - (26 if means else RIGHT) - BRACKET * len(brackets)
     axis = Axis.over([np.array(ends)], LEFT + (20 if means else HALF_TICK), stop, kind, margin=0.0)
     top = 16 if levels else 4
     bottom = top + ROW * len(rows)
@@ -82,7 +93,7 @@ def bars(
     for words, value in levels.items():
         at, half = axis.pixels(value), LETTER / 2 * len(words)
         out.append(f'<path class="level" d="M{at:.1f} {top}v2{at_bars.format(at)}"/>')
-        out.append(text(min(max(at, LEFT + half), WIDTH - half), top - 4, words, "m"))
+        out.append(text(min(max(at, LEFT + half), CHART_WIDTH - half), top - 4, words, "m"))
     for at, row in drawn:
         if row.value is not None and row.interval is None:
             digits, left = number(row.value), max(axis.pixels(0.0), axis.pixels(row.value)) + 4 + 4 * (kind == "log")
@@ -144,7 +155,7 @@ def stems(
     """
     values = np.array(list(groups.values()), float)
     at, zero = np.arange(1.0, len(values) + 1.0), np.zeros(len(values))
-    layers: list[Layer] = [LineMark(at, np.array(levels), 5, "dashed")] if len(levels) else []
+    layers: list[ChartLayer] = [LineMark(at, np.array(levels), 5, "dashed")] if len(levels) else []
     for j, column in enumerate(values.T):
         layers.append(Dots(at + 0.8 * ((j + 0.5) / values.shape[1] - 0.5), column, j, zero, column))
     texts = "; ".join(f"{below}: {', '.join(number(v, 2) for v in group)}" for below, group in groups.items())
@@ -157,7 +168,7 @@ def curves(figure: Figure, points: Sequence[Point], label: str, x_label: str, *,
 
     Each point has an interval; ``named``: the labels of the points are drawn.
     """
-    layers: list[Layer] = []
+    layers: list[ChartLayer] = []
     for colour, series in enumerate(dict.fromkeys(p.series for p in points)):
         of_series = sorted((p for p in points if p.series == series), key=lambda p: p.x)
         x, value, floor = (np.array(v, float) for v in zip(*((p.x, p.value, p.floor) for p in of_series), strict=True))

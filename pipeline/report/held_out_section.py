@@ -6,22 +6,22 @@ A unit without limits neither passes nor fails; a unit that failed does not pass
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.records import SENSOR_UNITS, SENSORS, Noise, Recording, SensorCalibration, Values
-from pipeline.report.chart import Area, Figure, Layer, LineMark, Panel, SampleMarks, chart, sentences
+from pipeline.report.chart import Area, ChartLayer, Figure, LineMark, Panel, SampleMarks, chart, sentences
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import number, plain
 from pipeline.validation.error_breakdown import with_known_effects
-from pipeline.validation.samples import OTHER, samples_of_motion
+from pipeline.validation.samples import OTHER_SENSOR, samples_of_motion
 
 if TYPE_CHECKING:
+    from pipeline.files import JSON
     from pipeline.report.numbers import Scale
     from pipeline.settings import Table
 
-JSON = dict[str, Any]
 # held-out errors of diagnosis and validation that agree within this factor are shown as one series
 EQUAL_ERROR_FACTOR = 1.2
 SOURCES = {
@@ -127,7 +127,7 @@ def held_out_figures(
         logged = sensor == "accelerometer" or (recording.table_rate is not None and table.latitude_deg is None)
         needed = fits[sensor].effects or not logged  # otherwise the attitude, which costs time, changes no magnitude
         reference = recording if needed else replace(recording, table_attitude=None)
-        samples = samples_of_motion(sensor, reference, SILENT, table, other=fits.get(OTHER[sensor]))
+        samples = samples_of_motion(sensor, reference, SILENT, table, other=fits.get(OTHER_SENSOR[sensor]))
         if samples is not None:
             vector, magnitude, _ = with_known_effects(fits[sensor], samples)
             raw = np.linalg.norm(samples.reading, axis=1) - samples.magnitude
@@ -152,7 +152,7 @@ def held_out_over_time(
     ``by_hand``: the reference lacks the acceleration of the moving unit.
     """
     unit, x = SENSOR_UNITS[sensor], recording.time - recording.time[0]
-    after: list[Layer] = [SampleMarks(x, calibrated, 2, mean=True)]
+    after: list[ChartLayer] = [SampleMarks(x, calibrated, 2, mean=True)]
     panels = [
         Panel([SampleMarks(x, raw, 3), SampleMarks(x, calibrated, 2)], f"error, {unit}", 120, {"": 0.0}),
         Panel([Area(-2 * floor, 2 * floor), *after] if floor else after, f"after, {unit}", 80),

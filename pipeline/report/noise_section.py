@@ -6,27 +6,27 @@ one-sided, ``N = noise_density / sqrt(2)``. Source: IEEE Std 952-1997, annex C.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S
-from pipeline.estimation.noise_terms import UNITS, allan_variance
+from pipeline.estimation.noise_terms import TERM_UNITS, allan_variance
 from pipeline.records import AXES, SENSOR_UNITS
-from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, LineMark, Panel, chart, sentences
+from pipeline.report.chart import AXES_LEGEND, Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
 from pipeline.report.numbers import number, percent, plain
 
 if TYPE_CHECKING:
+    from pipeline.files import JSON
     from pipeline.settings import DataSheet
 
-JSON = dict[str, Any]
 # Factor between white noise and data sheet above which a cause is named: the digital filters of an MPU-6050 (5 to
 # 260 Hz) change the white noise of a sample by sqrt(52) = 7 at one sampling rate, its ranges by 2 to 8.
 MAX_TIMES_DATA_SHEET = 5.0
 # factor between both below which they count as equal: data sheets state typical values to about 30 %
 EQUAL_NOISE_FACTOR = 1.3
 SURE_TERM_PROBABILITY = 0.9  # probability of a set of terms above which no other set is named
-SYMBOLS = dict(zip(UNITS, "QNBKGRA", strict=True))
+SYMBOLS = dict(zip(TERM_UNITS, "QNBKGRA", strict=True))
 
 
 def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON | None) -> Figure | None:
@@ -37,7 +37,7 @@ def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON |
     axes = {a: part for a, part in ((noise or {}).get("axes") or {}).items() if part["terms"]}
     if not noise or not axes:
         return None
-    unit, layers, density = SENSOR_UNITS[sensor], list[Layer](), data_sheet.stated("noise_density")
+    unit, layers, density = SENSOR_UNITS[sensor], list[ChartLayer](), data_sheet.stated("noise_density")
     for axis, part in axes.items():
         curve, colour = {k: np.array(v) for k, v in part["allan"].items()}, AXES.index(axis)
         layers += [

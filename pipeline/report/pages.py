@@ -21,8 +21,9 @@ from pipeline.verdicts import Verdict, error_in_row, kinds_of
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping
 
-JSON = dict[str, Any]
-FOLDER = Path(__file__).parent / "templates"
+    from pipeline.files import JSON
+
+TEMPLATES = Path(__file__).parent / "templates"
 OF_NUMBERS = (
     "aligned",
     "in_unit",
@@ -34,7 +35,7 @@ OF_NUMBERS = (
     "span",
     "typeset",
 )  # filters
-PUBLISHED = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # in a campaign's page
+PUBLISHED_DATA = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # in a campaign's page
 
 
 def _figure(value: object, scale: Scale | None = None) -> str:
@@ -45,7 +46,7 @@ def _figure(value: object, scale: Scale | None = None) -> str:
 @cache
 def _environment() -> Environment:
     environment = Environment(
-        loader=FileSystemLoader(FOLDER),
+        loader=FileSystemLoader(TEMPLATES),
         auto_reload=False,
         autoescape=select_autoescape(disabled_extensions=["md", "txt", "yaml"], default=True),
         trim_blocks=True,
@@ -67,14 +68,14 @@ def template(name: str) -> Template:
 
 def compile_templates() -> None:
     """Compile all templates before processes are forked from this one."""
-    for file in (*FOLDER.glob("*.html"), *FOLDER.glob("*.txt")):
+    for file in (*TEMPLATES.glob("*.html"), *TEMPLATES.glob("*.txt")):
         template(file.name)
 
 
 @cache
 def asset(name: str) -> Markup:
     """Return a style sheet or script of the templates' folder."""
-    return Markup((FOLDER / name).read_text(encoding="utf-8"))  # noqa: S704  (our own file)
+    return Markup((TEMPLATES / name).read_text(encoding="utf-8"))  # noqa: S704  (our own file)
 
 
 def unit_link(unit: str, published: Container[str] | None) -> Markup:
@@ -89,7 +90,7 @@ def linked(page: str, units: Iterable[str]) -> str:
         name, link = unit_link(unit, ()), unit_link(unit, None)
         for without, with_link in ((name, link), (script_data(name)[1:-1], script_data(link)[1:-1])):
             page = page.replace(str(without), str(with_link))
-    found = PUBLISHED.search(page)
+    found = PUBLISHED_DATA.search(page)
     if found:
         names = [*json.loads(found[1]), *units]
         page = page.replace(found[0], found[0].replace(found[1], script_data(sorted(set(names)))))

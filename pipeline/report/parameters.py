@@ -9,8 +9,8 @@ A sensor file limits those of ``K = P R`` without the rotation R of the unit: P 
 
     P dP + dP P = dK K^T + K dK^T
 
-In a row of the tables, the columns of every campaign (``COLUMNS``) come first, then the other columns of ``units.csv``.
-If such a column has the name of one in ``COLUMNS``, it gets the prefix ``sheet_``.
+In a row of the tables, the columns of every campaign (``SUMMARY_COLUMNS``) come first, then the other columns of
+``units.csv``. If such a column has the name of one in ``SUMMARY_COLUMNS``, it gets the prefix ``sheet_``.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ from pipeline.verdicts import Verdict, error_of
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from pipeline.files import JSON
     from pipeline.settings import DataSheet, Sensor
 
-JSON = dict[str, Any]
 UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
 SENSOR_COLUMNS = (
     "error_before", "error_after", "mean_abs_before", "mean_abs_after", "noise_floor", "verdict", "selected", "reason",
     "answers",
 )  # fmt: skip
-KINDS = ("beyond_limits", "implausible", "not_in_uncertainty", "not_held_out")
-OF_CALIBRATION = tuple(f"{s}_{c}" for c in KINDS for s in SENSORS)
+REMARK_KINDS = ("beyond_limits", "implausible", "not_in_uncertainty", "not_held_out")
+OF_CALIBRATION = tuple(f"{s}_{c}" for c in REMARK_KINDS for s in SENSORS)
 OF_UNIT = ("left_out", "incomplete")  # ``incomplete``: written by ``gather``, which knows what no stage could make
 # the error of the vector, where the attitude is known, and the next step where the verdict is not ``nothing_missing``
 NEXT = tuple(
@@ -58,10 +58,10 @@ NEXT = tuple(
     for s in SENSORS
     for c in ("vector_error_before", "vector_error_after", "vector_noise_floor", "next_step")
 )
-COLUMNS = (
+SUMMARY_COLUMNS = (
     *UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, *OF_UNIT, *NEXT
 )  # fmt: skip
-PARAMETERS = ("sensor", "parameter", "label", "measure", "value", "u", "U", "limit", "beyond", "fitted")
+PARAMETER_KEYS = ("sensor", "parameter", "label", "measure", "value", "u", "U", "limit", "beyond", "fitted")
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
 
@@ -193,7 +193,7 @@ def summary_row(
     """
     error = calibration.get("error") or {}
     file = f"{error['file']}: " if error.get("file") else ""
-    row: JSON = dict.fromkeys(COLUMNS) | {
+    row: JSON = dict.fromkeys(SUMMARY_COLUMNS) | {
         "unit": unit,
         **{key: units_table_row.get(key) or None for key in ("serial", "lot", "date")},
         "status": calibration.get("status"),
@@ -226,17 +226,19 @@ def summary_row(
         row[f"{sensor}_not_in_uncertainty"] = "; ".join(source for source, _ in beyond_uncertainty(part)) or None
     for key, value in units_table_row.items():
         if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:
-            row[f"sheet_{key}" if key in COLUMNS else key] = value
+            row[f"sheet_{key}" if key in SUMMARY_COLUMNS else key] = value
     return row
 
 
 def sheet_columns(row: JSON) -> dict[str, str]:
     """Return the values of a row that are from ``units.csv``."""
-    return {k: v for k, v in row.items() if v is not None and (k in ("serial", "lot", "date") or k not in COLUMNS)}
+    return {
+        k: v for k, v in row.items() if v is not None and (k in ("serial", "lot", "date") or k not in SUMMARY_COLUMNS)
+    }
 
 
 def unit_parameters(calibration: JSON, sensor_model: Sensor) -> list[tuple[Any, ...]]:
-    """Return a row with the columns ``PARAMETERS`` for each parameter of a unit; none for a failed unit.
+    """Return a row with the columns ``PARAMETER_KEYS`` for each parameter of a unit; none for a failed unit.
 
     These are the fitted parameters, and the elements of P that a sensor file limits.
     """

@@ -17,14 +17,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.model.kinematics import table_motion
 from pipeline.model.measurement import predicted_reading
 from pipeline.records import AXES, MEDIAN_SIZE, SENSOR_UNITS, Integers, Motion, Recording, SensorCalibration, Values
-from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, LineMark, Panel, SampleMarks, chart, sentences
+from pipeline.report.chart import (
+    AXES_LEGEND,
+    Area,
+    ChartLayer,
+    Dots,
+    Figure,
+    LineMark,
+    Panel,
+    SampleMarks,
+    chart,
+    sentences,
+)
 from pipeline.report.group_charts import stems
 from pipeline.report.numbers import number
 from pipeline.signal.encoder_rate import rate_by_angle
@@ -33,9 +44,9 @@ from pipeline.signal.filters import filtered
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from pipeline.files import JSON
     from pipeline.settings import Table
 
-JSON = dict[str, Any]
 RESIDUAL_BINS = 36  # of a covariate, and of a turn: 10 deg each
 MIN_BIN_SAMPLES = 5  # samples of a bin, below which it counts as empty: its scatter is unknown
 HARMONICS = 12  # cycles a turn; averaging over 36 bins reduces the amplitude of the last one by 16 %
@@ -221,7 +232,7 @@ def _covariate(sensor: str, label: str, mean: _BinnedMean, wander: Values) -> Fi
     panels = []
     for i, axis in enumerate(AXES):
         m, U = mean.mean[:, i], 2 * mean.error[:, i]
-        layers: list[Layer] = [Area(-2 * wander[i], 2 * wander[i])] if wander[i] > 0 else []
+        layers: list[ChartLayer] = [Area(-2 * wander[i], 2 * wander[i])] if wander[i] > 0 else []
         layers.append(Dots(mean.centre, m, i, m - U, m + U))
         panels.append(Panel(layers, f"{axis}, {unit}", height=64, levels={"": 0.0}, limits=(-top, top)))
     finding = f"Flat against {words}, within the noise"
@@ -269,7 +280,7 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
     known = bool(noise and noise.get("white"))
     sigma = np.hypot(white_noise(residual, noise), ((noise or {}).get("wander") or 0.0) if known else 0.0)
     every = slice(None, None, -(-len(x) // MODEL_POINTS))  # of the model, which has no noise, few points are enough
-    layers: list[Layer] = [SampleMarks(x, residual.reading)]
+    layers: list[ChartLayer] = [SampleMarks(x, residual.reading)]
     layers += [LineMark(x[every], residual.predicted[every, i], 5, "model") for i in range(3)]
     top = max(float(np.abs(residual.error).max()), 2.2 * float(sigma.max()))
     panels = [Panel(layers, f"reading, {unit}")]

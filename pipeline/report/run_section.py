@@ -5,7 +5,7 @@ The page of a unit has the section from the second run on that changed the unit.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.history import difference, dropped, of_units
 from pipeline.outcome import add_command, uncertainty_words
@@ -18,7 +18,8 @@ from pipeline.report.pages import template
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-JSON = dict[str, Any]
+    from pipeline.files import JSON
+
 MARK, LINK_MARK = "<!-- history -->", "<!-- history link -->"  # in templates/unit.html
 SHOWN = 12  # runs in a chart: the first, and the last ones
 LABEL_LETTERS = 50  # letters of a bar's text before the ratio; a bar is 66 letters long

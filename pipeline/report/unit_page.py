@@ -5,15 +5,15 @@ One file that works offline: style, script and charts are inline, and its conten
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.files import json_text
+from pipeline.files import JSON, json_text
 from pipeline.model.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 from pipeline.outcome import apply_command, as_overrides, commands_of, found_mountings, place, run_command
 from pipeline.records import AXES, BIAS, MATRIX, SENSOR_UNITS, SENSORS, Recording, Values
-from pipeline.report.chart import Figure, Layer, LineMark, Panel, chart
+from pipeline.report.chart import ChartLayer, Figure, LineMark, Panel, chart
 from pipeline.report.diagnosis_section import (
     added_variable,
     limit_rows,
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
     from pipeline.settings import Settings
 
-JSON = dict[str, Any]
 LEFT, LANE, LETTERS = 86, 17, 13  # px of the names, px of a lane, letters of a name
 USES = {"used": 1, "held out": 2, "left out": 0}  # of the rests that a fit found in the readings, with their colours
 LOGGED = 4  # colour of rests from a table's log
@@ -52,7 +51,7 @@ MOST_REASONS = 3  # sentences that are shown without unfolding
 KINDS_OF_ERROR = ("vector", "magnitude")
 ANGLE_STEP_S = 0.2  # over which a rate is computed from an angle: an encoder of 0.01 deg gives it to 0.05 deg/s
 STILL_ANGLE = 0.1  # deg/s, two steps of such an encoder
-STILL = 0.02  # deg/s, below which a table's log is noise of its rate
+MAX_RATE_OF_STILL_LOG_DPS = 0.02  # deg/s, below which a table's log is noise of its rate
 MARKS = ("after a gap", "clipped", "stuck", "repaired")  # of samples, by the bits of their flags
 
 
@@ -294,7 +293,7 @@ def _motion(recording: Recording, rests: int) -> str:
         logged = "the attitude is logged" if recording.table_attitude is not None else "by hand or not logged"
         return "at rest" if recording.role == "static" else logged
     fastest = float(np.max(np.abs(rate), initial=0.0))
-    if fastest < (STILL_ANGLE if by else STILL):
+    if fastest < (STILL_ANGLE if by else MAX_RATE_OF_STILL_LOG_DPS):
         return "at rest"
     kind = "stop-and-go" if rests > 2 else "continuous"
     return f"{kind}, {rests} rest{'s' if rests != 1 else ''}, up to {number(fastest)} deg/s{by}"
@@ -323,7 +322,7 @@ def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibrat
     begin = {r.name: float(r.time[0]) - first if one_file else 0.0 for r in drawn}
     narrowest = NARROWEST * max(begin[r.name] + _duration(r) for r in drawn)
     lanes = drawn[::-1]  # the first at the top
-    layers: list[Layer] = []
+    layers: list[ChartLayer] = []
     for y, r in enumerate(lanes, 1):
         layers.append(LineMark(np.array([0.0, _duration(r)]) + begin[r.name], np.full(2, float(y)), 3))
         for colour in sorted({c for *_, c in spans[r.name]}):

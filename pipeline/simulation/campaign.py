@@ -46,8 +46,20 @@ if TYPE_CHECKING:
     from pipeline.simulation.sensor import Hidden, SimulatedSensor
     from pipeline.simulation.trajectory import Planned
 
-COLUMNS = ("unit", "serial", "lot", "date", "sensor", "table", "procedure", "method", "ingest", "filter", "overrides")
-CAMPAIGN = "# Hydra overrides for all units of this campaign.\noverrides: []\n"
+UNITS_CSV_COLUMNS = (
+    "unit",
+    "serial",
+    "lot",
+    "date",
+    "sensor",
+    "table",
+    "procedure",
+    "method",
+    "ingest",
+    "filter",
+    "overrides",
+)
+CAMPAIGN_YAML = "# Hydra overrides for all units of this campaign.\noverrides: []\n"
 
 
 def write_campaign(
@@ -83,12 +95,12 @@ def write_campaign(
         path.write_text(json.dumps({**truth, "unit": unit.unit}, indent=1) + "\n", encoding="utf-8")
         progress(f"{unit.unit}: {sum(r.samples for r in recordings)} samples in {len(recordings)} recordings")
     table = pd.DataFrame(_sheet_rows(description), dtype=object)
-    columns = [*(c for c in COLUMNS if c in table), *(c for c in table if c not in COLUMNS)]
+    columns = [*(c for c in UNITS_CSV_COLUMNS if c in table), *(c for c in table if c not in UNITS_CSV_COLUMNS)]
     (directory / "units.csv").write_text(
         table.to_csv(columns=columns, index=False, lineterminator="\n"), encoding="utf-8"
     )
     if not (directory / "campaign.yaml").exists():
-        (directory / "campaign.yaml").write_text(CAMPAIGN, encoding="utf-8")
+        (directory / "campaign.yaml").write_text(CAMPAIGN_YAML, encoding="utf-8")
 
 
 def _sheet_rows(description: Description) -> list[dict[str, Any]]:

@@ -48,13 +48,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 FORMATS = ("csv", "mcap")
-KINDS = ("rows", "file", "program")
-_, FILE, PROGRAM = KINDS
+DESCRIPTION_KINDS = ("rows", "file", "program")
+_, BY_FILE, BY_PROGRAM = DESCRIPTION_KINDS
 UNITS_OF_A_LOT = 25  # for units that are described by a count: a round number
 # By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
-BY_HAND = Course(dwell_s=4.0, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
+COURSE_BY_HAND = Course(dwell_s=4.0, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
 # Each turn there and back, the second held out between rests of 4 s or longer; 360 deg in some 3 s.
-FACES_AND_TURNS = replace(BY_HAND, dwell_s=5.0, rates_dps=(120.0,), both_directions=True)
+FACES_AND_TURNS = replace(COURSE_BY_HAND, dwell_s=5.0, rates_dps=(120.0,), both_directions=True)
 RECORDED = ("sensor", "table", "procedure", "samples", "interval_s", "lost")
 
 
@@ -118,7 +118,7 @@ class UnitDescription(Described):
             raise ConfigurationError("a separate table_log is written in csv only")
         if log != "rows" and self.procedure not in TABLE_PROCEDURES:
             raise ConfigurationError(f"procedure {self.procedure} has no table to log")
-        if log == PROGRAM and self.procedure == ONE_RECORDING:
+        if log == BY_PROGRAM and self.procedure == ONE_RECORDING:
             raise ConfigurationError(f"procedure {ONE_RECORDING} has moves that no program describes")
 
     @property
@@ -128,7 +128,7 @@ class UnitDescription(Described):
 
     def whole_course(self) -> Course:
         """Return how the procedure is run, with its default lengths."""
-        base = FACES_AND_TURNS if self.procedure == FERRARIS else BY_HAND
+        base = FACES_AND_TURNS if self.procedure == FERRARIS else COURSE_BY_HAND
         return replace(Course() if self.procedure in TABLE_PROCEDURES else base, **self.course)
 
 
@@ -253,8 +253,9 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--procedure", metavar="NAME", help="configs/procedure (three_axis_turns)")
     add("--samples", type=int, metavar="N", help="approximate rows of a unit; scales rests and held-out motion")
     add("--interval", dest="interval_s", type=float, metavar="S", help="sampling interval in s (0.12)")
-    add("--table-log", choices=KINDS, help="where the table is logged: in the sensor's rows (the default), in a file "
-        "with a separate clock, or not at all: then its program is known")  # fmt: skip
+    add("--table-log", choices=DESCRIPTION_KINDS,
+        help="where the table is logged: in the sensor's rows (the default), in a file with a separate clock, or not "
+        "at all: then its program is known")  # fmt: skip
     add("--lost", type=float, metavar="SHARE", help="share of the samples that the radio link loses (0)")
     add = parser.add_argument_group("how the procedure is run").add_argument
     add("--dwell", dest="dwell_s", type=float, metavar="S", help="rest at each stop (1; without a table 4)")

@@ -180,7 +180,7 @@ def alter(scene: Scene, effects: Mapping[str, Values]) -> Scene:
     return scene
 
 
-KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
+SENSOR_KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
 NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # they replace figures of the sensor file
 POSITIVE = {"time_constant", "tau"}  # parameters without a sign
 
@@ -251,9 +251,9 @@ def drawn_sensors(
     mounting = rng.uniform(-1.0, 1.0, 3)
     out = {}
     for sensor in SENSORS:
-        unknown = sorted(set(given[sensor]) - KEYS - NOISE_KEYS)
+        unknown = sorted(set(given[sensor]) - SENSOR_KEYS - NOISE_KEYS)
         if unknown:
-            known = ", ".join(sorted(KEYS | NOISE_KEYS))
+            known = ", ".join(sorted(SENSOR_KEYS | NOISE_KEYS))
             raise ConfigurationError(f"{sensor}: {', '.join(unknown)} is not known; known: {known}")
         noise = {key: given[sensor][key] for key in NOISE_KEYS & set(given[sensor])}
         data_sheet = sensor_model.of(sensor).replaced(**noise)
@@ -271,7 +271,7 @@ def _matrix(data_sheet: DataSheet, given: Mapping[str, Any], mounting: Values, r
     skew = np.degrees(_limited(data_sheet.cross_axis, rng))
     if "matrix" in given:
         return np.array(given["matrix"], float)
-    if KEYS & set(given) - {"bias"}:
+    if SENSOR_KEYS & set(given) - {"bias"}:
         scale, skew, mounting = np.ones(3), np.zeros(3), np.zeros(3)
     scale = np.array(given.get("scale_factor", scale), float)
     lower = np.eye(3)

@@ -30,7 +30,7 @@ from pipeline.model.kinematics import earth_of
 from pipeline.records import AXES, SENSORS, Recording, continuous
 from pipeline.settings import ProgramRest, Repeated
 from pipeline.simulation import procedures
-from pipeline.simulation.description import FILE, PROGRAM, course_of, read_option
+from pipeline.simulation.description import BY_FILE, BY_PROGRAM, course_of, read_option
 from pipeline.simulation.procedures import ONE_RECORDING
 from pipeline.simulation.sensor import Scene, alter, bias_wander, decimals_of
 from pipeline.simulation.trajectory import CommandedTurns, Gimbals, RestsAndMoves, random_errors, rotation_by
@@ -240,9 +240,9 @@ def with_table_log(
     else:
         groups = [(r, [p], [s]) for r, p, s in zip(recordings, planned, starts, strict=True)]
     whole = [recording for recording, _, _ in groups]
-    if log.kind == PROGRAM:
+    if log.kind == BY_PROGRAM:
         return [replace(r, **NO_TABLE) if r.axis is not None else r for r in whole], None
-    if log.kind != FILE:
+    if log.kind != BY_FILE:
         return [_wrapped(r) if log.wrapped else r for r in whole], None
     offset, ppm = rng.uniform(0.0, LARGEST_OFFSET_S), DRIFT_PPM * rng.standard_normal()
     offset = float(offset if log.offset_s is None else log.offset_s)
@@ -316,7 +316,9 @@ def as_program(program: Program) -> list[ProgramRest | ProgramTurn | Repeated]:
 
 def columns_of(unit: UnitDescription) -> dict[str, str]:
     """Return the columns of ``units.csv`` that the unit's table log requires."""
-    return {FILE: {"ingest": INGEST}, PROGRAM: {"procedure": f"{unit.procedure}_commanded"}}.get(unit.log.kind, {})
+    return {BY_FILE: {"ingest": INGEST}, BY_PROGRAM: {"procedure": f"{unit.procedure}_commanded"}}.get(
+        unit.log.kind, {}
+    )
 
 
 def programs_of(units: Sequence[UnitDescription]) -> dict[str, str]:
@@ -326,7 +328,7 @@ def programs_of(units: Sequence[UnitDescription]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for unit in units:
-        if unit.log.kind == PROGRAM:
+        if unit.log.kind == BY_PROGRAM:
             text = _procedure_text(unit.procedure, course_of(unit))
             if found.setdefault(columns_of(unit)["procedure"], text) != text:
                 raise ConfigurationError(

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from pipeline.records import Index, Values
 
 
-Step: TypeAlias = ProgramRest | ProgramTurn
+ProgramStep: TypeAlias = ProgramRest | ProgramTurn
 SWING_RMS_DEG = np.array([60.0, 42.0, 60.0])  # 42 deg of the middle gimbal: uniform attitudes (``random_gimbals``)
 PERIOD_S = 40.0  # longest period of the sinusoids before the speed is scaled; its value cancels
 SINUSOIDS = 4  # for each gimbal
@@ -87,17 +87,17 @@ def rotation_by(vector_deg: Values) -> Values:
     return turn_by_vector(np.radians(vector_deg))
 
 
-def rest(seconds: float) -> Step:
+def rest(seconds: float) -> ProgramStep:
     """Return a rest as a step of a program."""
     return ProgramRest(rest_s=seconds)
 
 
-def turn(angle: float, rate: float, acceleration: float) -> Step:
+def turn(angle: float, rate: float, acceleration: float) -> ProgramStep:
     """Return a turn as a step of a program: angle in deg, signed; largest rate in deg/s; ramps in deg/s^2."""
     return ProgramTurn(turn_deg=angle, rate_dps=rate, acceleration_dps2=acceleration)
 
 
-def turn_with_plateau(angle: float, rate: float, acceleration: float) -> Step:
+def turn_with_plateau(angle: float, rate: float, acceleration: float) -> ProgramStep:
     """Return a turn that covers ``angle`` at full ``rate``, plus the ramps before and after."""
     return turn(angle + float(np.sign(angle)) * rate**2 / acceleration, rate, acceleration)
 

@@ -15,16 +15,23 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from pipeline.errors import PipelineError, failure_of
-from pipeline.files import flushed_together, read_json, write_atomically, write_json
+from pipeline.files import JSON, flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record
 from pipeline.io.digests import digests_in_pack
-from pipeline.pack import PACKS, STAGES, WITH_PRIOR, Batch, Pack, as_bytes, batches_of, is_published
+from pipeline.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch, Pack, as_bytes, batches_of, is_published
 from pipeline.report.campaign_page import render
 from pipeline.report.comparison import against_truth, section
 from pipeline.report.fleet import fleet_statistics, parameter_table, write_parameters, write_summary
 from pipeline.report.parameters import Parameter
 from pipeline.report.run_section import runs_data, times_of, with_history
-from pipeline.results_folder import NEW_FOLDER, PUBLISHED, finish_publishing, publish, published_units, record_units
+from pipeline.results_folder import (
+    NEW_FOLDER,
+    PUBLISHED_PATHS,
+    finish_publishing,
+    publish,
+    published_units,
+    record_units,
+)
 from pipeline.stages.summary import failed_files, failed_summary
 from pipeline.version import VERSION
 
@@ -32,8 +39,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from pipeline.stages.batch import Job
-
-JSON = dict[str, Any]
 
 
 def gather_batch(job: Job) -> None:
@@ -45,7 +50,7 @@ def gather_batch(job: Job) -> None:
     finish_publishing(results)
     new = results / NEW_FOLDER
     shutil.rmtree(new, ignore_errors=True)
-    for name in PUBLISHED:
+    for name in PUBLISHED_PATHS:
         if "." not in name:
             (new / name).mkdir(parents=True)
     packed = len(run["order"]) > run["publish_limit"]
@@ -63,7 +68,7 @@ def gather_batch(job: Job) -> None:
                 found[unit] = _gather_unit(batch, unit, new, publish=not packed or unit in asked)
             digests |= {unit: found[unit].pop("sha256", []) or _digests_of_failed(folder, unit) for unit in units}
             parts.append(parameter_table({unit: found[unit].pop("parameters") for unit in units}))
-            for stage in (*STAGES, *([WITH_PRIOR] if batch.combined else [])) if packed else ():
+            for stage in (*PACKED_STEPS, *([WITH_PRIOR] if batch.combined else [])) if packed else ():
                 _link(folder / f"{stage}.zip", new / PACKS / name / f"{stage}.zip")
         units = {unit: found[unit] for unit in run["order"]}
         parameters = pd.DataFrame({"unit": run["order"]}).merge(pd.concat(parts), on="unit")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import DamagedFileError
 from pipeline.exports import exports
-from pipeline.pack import DOCUMENTS, STAGE_OF, Pack, as_bytes, new_pack
+from pipeline.pack import DOCUMENT_FOLDERS, STAGE_OF, Pack, as_bytes, new_pack
 from pipeline.records import SENSORS, Validation, fit_from_json
 from pipeline.report.combined import UnitEstimate, UnitPrior, calibration_with_prior, priors_of, with_card
 from pipeline.stages.batch import record_output
@@ -52,7 +52,7 @@ def prior_unit(job: Job, unit: str, settings: Settings) -> Files:
     if not given:
         return {}
     priors = {sensor: UnitPrior.read(prior) for sensor, prior in given.items()}
-    calibration, validation, diagnosis = (job.inputs[STAGE_OF[of]].json(f"{unit}.json") for of in DOCUMENTS)
+    calibration, validation, diagnosis = (job.inputs[STAGE_OF[of]].json(f"{unit}.json") for of in DOCUMENT_FOLDERS)
     document = calibration_with_prior(calibration, priors)
     files: Files = {}
     if document:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.errors import PipelineError
 from pipeline.history import unit_state
@@ -15,11 +15,11 @@ from pipeline.report.parameters import sheet_columns, summary_row, unit_paramete
 from pipeline.settings import Stated
 
 if TYPE_CHECKING:
+    from pipeline.files import JSON
     from pipeline.pack import Files, Pack
     from pipeline.settings import Sensor, Settings
     from pipeline.stages.batch import Job
 
-JSON = dict[str, Any]
 KEPT = ("schema_version", "sensor", "table", "procedure", "method", "config_sha256", "software")
 
 

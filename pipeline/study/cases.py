@@ -65,9 +65,17 @@ ALTERNATIVES = [  # not hidden together: their signals are nearly alike
 FACTOR = {"small": 0.3, "tiny": 0.1}  # of the sensor file's size
 WANDER = {"white": 0.0, "normal": 1.0, "wander": 5.0, "random_walk": 0.0, "one_over_f": 0.0}  # of the sensor file's
 STIM_SHARE = 0.25  # of the units of the families that have both models
-METHODS = REFERENCE, STAGED, BY_HAND = "reference_least_squares", "staged", "rests_and_moves"  # that fit a base
+METHODS = REFERENCE, STAGED, METHODS_OF_HAND_HELD_CASES = (
+    "reference_least_squares",
+    "staged",
+    "rests_and_moves",
+)  # that fit a base
 INTERVAL_S, INTERVAL_BY_HAND_S = 0.12, 0.01  # of a sample: the default of a simulation; by hand, moves are faster
-TABLES = {"acutronic": 0.5, "mark2": 0.45, "single_axis": 0.05}  # and their shares; the last takes 20 times as long
+TABLE_SHARES = {
+    "acutronic": 0.5,
+    "mark2": 0.45,
+    "single_axis": 0.05,
+}  # and their shares; the last takes 20 times as long
 RESTS_BY_HAND = 15, 40  # by hand; from 15 on, some are held out of a fit
 CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
 
@@ -121,9 +129,13 @@ def draw(family: str, number: int, seed: int) -> StudyCase:
         if detail == "sensors" or by_hand:
             case = replace(case, model=str(rng.choice(sensor_files(INTERVAL_BY_HAND_S if by_hand else INTERVAL_S))))
         if detail == "sensors":
-            return replace(case, noise="normal", table=str(rng.choice([*TABLES], p=[*TABLES.values()])))
+            return replace(case, noise="normal", table=str(rng.choice([*TABLE_SHARES], p=[*TABLE_SHARES.values()])))
         rests = int(rng.integers(RESTS_BY_HAND[0], RESTS_BY_HAND[1] + 1)) if by_hand else 0
-        return replace(case, procedure="multi_position", method=BY_HAND, table="hand", rests=rests) if by_hand else case
+        return (
+            replace(case, procedure="multi_position", method=METHODS_OF_HAND_HELD_CASES, table="hand", rests=rests)
+            if by_hand
+            else case
+        )
     if kind in ("shape", "cycle"):
         procedure = "continuous" if detail == "band" else "stop_and_go"
         amplitude = tuple((rng.uniform(0.7, 1.3, 3) * rng.choice([-1.0, 1.0], 3)).tolist())

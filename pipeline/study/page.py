@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from pipeline.study.result import ScoredCase
 
-Rows = list[list[Any]]
+TableRows = list[list[Any]]
 LISTED = 40  # cases on the page that miss a goal
 OF_SIZE = ("single", "small", "tiny")
 OUTCOMES = ("unexplained", "other warning", "answered", "silent", "nothing")  # with physics of another form
@@ -83,7 +83,7 @@ def _said(case: ScoredCase) -> str:
     return " + ".join(case.selected) or "nothing"
 
 
-def found_at(answers: pd.DataFrame) -> Rows:
+def found_at(answers: pd.DataFrame) -> TableRows:
     """Return for each sensor and effect in how many cases of each size it was selected first, ``n of m``."""
     of_size = answers[answers["family"].isin(OF_SIZE) & (answers["model"] == "mpu6050")]
     count = of_size.pivot_table("first", ["sensor", "hidden"], "family", lambda f: f"{f.sum()} of {len(f)}", "")
@@ -91,20 +91,20 @@ def found_at(answers: pd.DataFrame) -> Rows:
     return [[sensor, f"`{name}`", *counts] for (sensor, name), *counts in rows]
 
 
-def confusions(answers: pd.DataFrame) -> Rows:
+def confusions(answers: pd.DataFrame) -> TableRows:
     """Return how often another effect was named for one hidden effect, the most frequent first."""
     wrong = answers[~answers["left_out"] & (answers["family"] != "unseen") & ~answers["alone"]]
     counts = wrong.groupby(["sensor", "hidden", "said"]).size().sort_values(ascending=False, kind="stable")
     return [[sensor, f"`{name}`", other, count] for (sensor, name, other), count in counts.items()]
 
 
-def instead(answers: pd.DataFrame) -> Rows:
+def instead(answers: pd.DataFrame) -> TableRows:
     """Return the answers for effects that were removed from the catalogue, with or without a warning."""
     counts = answers[answers["left_out"]].groupby(["sensor", "hidden", "said", "warned"]).size()
     return [[sensor, f"`{name}`", *rest, count] for (sensor, name, *rest), count in counts.items()]
 
 
-def by_signal(cases: Iterable[ScoredCase]) -> Rows:
+def by_signal(cases: Iterable[ScoredCase]) -> TableRows:
     """Return the share of the hidden effects that were selected, by bins of their lambda."""
     found = pd.DataFrame(
         [
@@ -124,7 +124,7 @@ def by_signal(cases: Iterable[ScoredCase]) -> Rows:
     return rows
 
 
-def of_shapes(cases: Sequence[ScoredCase]) -> Rows:
+def of_shapes(cases: Sequence[ScoredCase]) -> TableRows:
     """Return a row for each form of unknown physics: the answers, and their effect on the held-out error."""
     rows = []
     for family in sorted({case.family for case in cases if case.shape and not case.error}):
@@ -145,7 +145,7 @@ def _outcome(case: ScoredCase) -> str:
     return "answered" if outside_answered(case) else "silent"
 
 
-def _misses(cases: Sequence[ScoredCase], scores: Sequence[ScoreLine]) -> Rows:
+def _misses(cases: Sequence[ScoredCase], scores: Sequence[ScoreLine]) -> TableRows:
     by_key = {key: case for case in cases for key in (case.key, f"{case.key} {case.sensor}")}
     keys = [key for score in scores if score.goal for key in score.misses]
     rows = []
@@ -159,7 +159,7 @@ def _misses(cases: Sequence[ScoredCase], scores: Sequence[ScoreLine]) -> Rows:
     return [*rows, *([[f"and {more} more", "", "", ""]] if more else [])]
 
 
-def _sensor_file_sizes() -> Rows:
+def _sensor_file_sizes() -> TableRows:
     rows = []
     for model, sensors in SIZES.items():
         for sensor, sizes in sensors.items():

@@ -19,7 +19,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from pipeline.config import code_digest
 from pipeline.errors import CannotCalibrateError, ConfigurationError, PipelineError
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from pipeline.files import JSON
     from pipeline.one_unit import ConfiguredUnit
     from pipeline.unit import UnitState
 
 
-TRUTH, RESULTS = "truth.jsonl", "results.jsonl"
-JSON = dict[str, Any]
-HELD_OUT = ("single", "pairs", "triples", "one_axis", "shape", "cycle")
+TRUTH_FILE, RESULTS_FILE = "truth.jsonl", "results.jsonl"
+FAMILIES_WITH_HELD_OUT_ERRORS = ("single", "pairs", "triples", "one_axis", "shape", "cycle")
 
 
 def run_study(
@@ -59,19 +59,19 @@ def run_study(
     has cases of another seed.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    others = {line["seed"] for line in read_lines(directory / TRUTH)} - {seed}
+    others = {line["seed"] for line in read_lines(directory / TRUTH_FILE)} - {seed}
     if others:
         raise ConfigurationError(
             f"holds cases of seed {min(others)}, not {seed}; choose another directory, or that seed",
-            str(directory / TRUTH),
+            str(directory / TRUTH_FILE),
         )
-    done = {line["key"] for line in read_lines(directory / RESULTS)}
+    done = {line["key"] for line in read_lines(directory / RESULTS_FILE)}
     code = code_digest(*code_of_study())
     planned = [(family, number, seed) for number in range(count) for family in families]
     planned = [item for item in planned if draw(*item).key not in done]
     with (
-        (directory / TRUTH).open("a", encoding="utf-8") as truth,
-        (directory / RESULTS).open("a", encoding="utf-8") as results,
+        (directory / TRUTH_FILE).open("a", encoding="utf-8") as truth,
+        (directory / RESULTS_FILE).open("a", encoding="utf-8") as results,
     ):
         for number, (hidden, entries) in enumerate(_judged(planned, processes), start=1):
             truth.write(json.dumps(hidden) + "\n")
@@ -131,7 +131,7 @@ def judge(case: StudyCase) -> list[JSON]:
             result["gains"] = {entry["effect"]: entry["delta_bic"] for entry in ranking}
         if whole:
             result["whole"] = scored(whole, sensor)
-        if case.kind in HELD_OUT:
+        if case.kind in FAMILIES_WITH_HELD_OUT_ERRORS:
             result["held_out"] = held_out_errors(unit, state, sensor, result["selected"])
         out.append(result)
     spent = (time.process_time() - began) / len(out)

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from pipeline.estimation.free_curves import OTHER
+from pipeline.estimation.free_curves import OTHER_PREFIX
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW
 from pipeline.model.effects import effect
 from pipeline.report.chart import Dots, Figure, LineMark, Panel, chart
@@ -76,7 +76,7 @@ def warned(case: ScoredCase) -> bool:
 
 def outside_answered(case: ScoredCase) -> bool:
     """Return whether one of the answers is an effect outside the catalogue."""
-    return any(name.startswith(OTHER) for answer in case.answer_set or [] for name in answer)
+    return any(name.startswith(OTHER_PREFIX) for answer in case.answer_set or [] for name in answer)
 
 
 def not_silent(case: ScoredCase) -> bool:
@@ -106,7 +106,7 @@ def stands_out(case: ScoredCase) -> bool:
 
 
 # Family, what is counted, how it is judged, goal.
-PLAN: list[tuple[str, str, Callable[[ScoredCase], bool], str]] = [
+SCORED_FAMILIES: list[tuple[str, str, Callable[[ScoredCase], bool], str]] = [
     ("single", "one effect at the sensor file's size: named first", first_is_right, ">= 98 %"),
     ("single", "... and nothing else named", exact, ""),
     ("small", "one effect, x0.3: named first", first_is_right, ""),
@@ -183,7 +183,7 @@ def accepted(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
 def family_scores(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
     """Return the scores of every family that was run, and the share of the held-out excess that was removed."""
     found: list[ScoreLine] = []
-    for family, name, right, goal in PLAN:
+    for family, name, right, goal in SCORED_FAMILIES:
         family_cases = [c for c in cases if c.family == family]
         if family == "removed":
             family_cases = [c for c in family_cases if c.error or hard_to_replace(c)]

@@ -42,7 +42,6 @@ from pipeline.thesis.tables import (
     CONTINUOUS,
     DEVICES,
     GYROSCOPE,
-    JSON,
     RATES,
     STOPS,
     Results,
@@ -56,17 +55,18 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from pipeline.files import JSON
     from pipeline.records import Values
 
     Place = tuple[str, str]  # set of recordings and method
 
 
 CONFIRMED, REFUTED, NO_DIFFERENCE, NOT_DECIDED = "confirmed", "refuted", "no difference", "not decided"
-KINDS = {CONFIRMED: "good", REFUTED: "bad", NO_DIFFERENCE: "warn", NOT_DECIDED: "warn"}  # CSS classes
+CSS_CLASSES = {CONFIRMED: "good", REFUTED: "bad", NO_DIFFERENCE: "warn", NOT_DECIDED: "warn"}  # CSS classes
 SMALLEST = 0.01  # of the error: smaller differences are negligible
 EQUAL_RATE_SHARE = 0.05  # of the error: largest difference between rates that count as equal
-READINGS = {"printed": "as printed", "staged": "errata corrected"}
-FILTERS = {
+EQUATIONS_AS = {"printed": "as printed", "staged": "errata corrected"}
+FINDINGS_OF_FILTERS = {
     "same-gain": "growth behind a filter of the same gain without delay",
     "zero-phase": "growth behind the filter run both ways, its gain twice,",
 }
@@ -77,7 +77,7 @@ TRUE_SCALE = {
     "mpu6050-2": (0.993, 0.996, 0.986),
     "stim300": (1.002, 1.003, 0.998),
 }  # by least squares, table 5.23
-BIAS = [f"b_{a}_g" for a in AXES]
+BIAS_KEYS = [f"b_{a}_g" for a in AXES]
 
 
 class FindingLine(NamedTuple):
@@ -92,7 +92,7 @@ class FindingLine(NamedTuple):
 
 def verdict_of(lines: Sequence[FindingLine]) -> str:
     """Return the common verdict of all comparisons of a conclusion, or the count of each verdict."""
-    counts = {v: n for v in KINDS if (n := sum(line.verdict == v for line in lines))}
+    counts = {v: n for v in CSS_CLASSES if (n := sum(line.verdict == v for line in lines))}
     return ", ".join(v if n == len(lines) else f"{v} in {n} of {len(lines)}" for v, n in counts.items())
 
 
@@ -113,7 +113,9 @@ class Errors:
         first = self._errors[smaller]
         return _compared(what, first, self._errors[larger], SMALLEST * mean_of(first).value)
 
-    def lines(self, what: str, smaller: str, larger: str, methods: Mapping[str, str] = READINGS) -> list[FindingLine]:
+    def lines(
+        self, what: str, smaller: str, larger: str, methods: Mapping[str, str] = EQUATIONS_AS
+    ) -> list[FindingLine]:
         """Compare two procedures on each device by each method."""
         return [
             self.line(f"{name}, {reading}: {what}", (f"{device}-{smaller}", method), (f"{device}-{larger}", method))
@@ -181,11 +183,11 @@ def gain_of_filter(rate: float) -> float:
 def conclusions(rows: pd.DataFrame) -> dict[str, list[FindingLine]]:
     """Return the comparisons of each conclusion of the thesis, from the rows of the study over seeds."""
     errors, devices = Errors(rows), DEVICES.items()
-    unfiltered = {**READINGS, "unfiltered": "errata corrected, no filter"}
+    unfiltered = {**EQUATIONS_AS, "unfiltered": "errata corrected, no filter"}
     slow, fast, rates = "continuous-1dps", "continuous-30dps", [rate for rate in RATES if rate != "gyro-100dps"]
     growths = [
         errors.growth(f"{name}, errata corrected: {what} against that behind the causal one", device, method, "staged")
-        for method, what in FILTERS.items()
+        for method, what in FINDINGS_OF_FILTERS.items()
         for device, name in devices
     ]
     least_squares = [
@@ -194,7 +196,7 @@ def conclusions(rows: pd.DataFrame) -> dict[str, list[FindingLine]]:
             (recordings, method),
             (recordings, "least-squares"),
         )
-        for method, reading in READINGS.items()
+        for method, reading in EQUATIONS_AS.items()
         for device, name in devices
         for recordings in [f"{device}-{'continuous-0.5dps' if device == 'stim300' else 'stop-1s'}"]
     ]
@@ -205,14 +207,14 @@ def conclusions(rows: pd.DataFrame) -> dict[str, list[FindingLine]]:
     ]
     tables = [
         errors.line(
-            f"{in_words(procedure)}, {READINGS[method]}: precise against home-made",
+            f"{in_words(procedure)}, {EQUATIONS_AS[method]}: precise against home-made",
             (f"mpu6050-1-{procedure}", method),
             (f"mpu6050-1-mark2-{procedure}", method),
         )
         for procedure, method in (("stop-1s", "printed"), ("stop-1s", "staged"), ("gyro-60dps", "staged"))
     ]
     return {
-        "best_procedure": errors.against_the_best("stop-10s", (*STOPS[:2], *CONTINUOUS), READINGS),
+        "best_procedure": errors.against_the_best("stop-10s", (*STOPS[:2], *CONTINUOUS), EQUATIONS_AS),
         "equal_duration": errors.lines("continuous 1 deg/s against stop 1 s", slow, "stop-1s"),
         "speed": errors.lines("continuous 1 deg/s against 30 deg/s", slow, fast, unfiltered),
         "delay": growths,
@@ -268,7 +270,7 @@ def evidence(printed: Path, results: Results, rows: pd.DataFrame) -> JSON:
         "misalignment": [
             {
                 "device": DEVICES[str(device)],
-                "of_bias": float(np.prod(np.sqrt(1.0 - of_device[BIAS].median() ** 2))),
+                "of_bias": float(np.prod(np.sqrt(1.0 - of_device[BIAS_KEYS].median() ** 2))),
                 "ours": results.parameter(f"{device}-stop-1s-printed", "accelerometer", "misalignment", "M_P_x"),
                 "printed": sorted({f"{m:.3f}" for m in of_device["M_x"]}),
             }
@@ -322,7 +324,7 @@ def agreements(printed: Path, results: Results) -> pd.DataFrame:
     """
     found: list[tuple[str, str, float, list[Values]]] = []
     rows = _on_precise_table(printed, "accel_parameters")
-    median = rows.groupby("device")[BIAS].median()
+    median = rows.groupby("device")[BIAS_KEYS].median()
     for title, method in reversed(ACCELEROMETER.items()):
         fits = [
             (row, *results.calibration(f"{row['set']}-{method}", "accelerometer")) for row in rows.to_dict("records")
@@ -376,7 +378,7 @@ def scatters(printed: Path, seeds: pd.DataFrame) -> pd.DataFrame:
         for quantity, centre in (
             ("O", {"y": 1.0, "z": 1.0}),
             ("S", dict(zip(AXES, TRUE_SCALE[device], strict=True))),
-            ("b", dict(zip(AXES, device_rows[BIAS].median(), strict=True))),
+            ("b", dict(zip(AXES, device_rows[BIAS_KEYS].median(), strict=True))),
         ):
             unit = "_g" if quantity == "b" else ""
             columns = [f"{quantity}_{a}" for a in centre]

@@ -10,7 +10,7 @@ import math
 import re
 from dataclasses import replace
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -24,7 +24,7 @@ from pipeline.report.held_out_section import held_out_over_time
 from pipeline.report.numbers import MINUS, NOTHING, number
 from pipeline.report.pages import template
 from pipeline.simulation.description import shipped_settings
-from pipeline.thesis.findings import KINDS, Errors, agreements, conclusions, evidence, scatters, verdict_of
+from pipeline.thesis.findings import CSS_CLASSES, Errors, agreements, conclusions, evidence, scatters, verdict_of
 from pipeline.thesis.seeds import CAUSES, device_of
 from pipeline.thesis.tables import (
     CONTINUOUS,
@@ -43,9 +43,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
+    from pipeline.files import JSON
     from pipeline.report.comparison import MeanWithUncertainty
-
-JSON = dict[str, Any]
 
 
 def render(campaign: Path, folder: Path) -> str:
@@ -63,7 +62,7 @@ def render(campaign: Path, folder: Path) -> str:
         evidence=evidence(printed, results, rows),
         conclusions=conclusions(rows),
         verdict_of=verdict_of,
-        kinds=KINDS,
+        kinds=CSS_CLASSES,
         difference=_difference,
         agreements=agreements(printed, results).to_dict("records"),
         explanations=sorted((e for e in explanations if e["key"] in set(cells["key"])), key=itemgetter("key")),
@@ -104,7 +103,7 @@ BELOW = {
     "accelerometer": "stop and go, rest in s; continuous, deg/s",
     "gyroscope": "rate, deg/s",
 }
-FILTERS = {
+FILTER_NAMES = {
     "staged": "RC low-pass",
     "same-gain": "the same gain without delay",
     "zero-phase": "run both ways, the gain twice",
@@ -237,7 +236,7 @@ def _speed(rows: pd.DataFrame) -> Figure:
     """Draw the error of continuous rotation by rate, behind each filter."""
     errors = Errors(rows)
     points = []
-    for method, name in FILTERS.items():
+    for method, name in FILTER_NAMES.items():
         for procedure in CONTINUOUS:
             mean = errors.mean(f"mpu6050-2-{procedure}", method)
             rate = _short(procedure)
@@ -248,7 +247,7 @@ def _speed(rows: pd.DataFrame) -> Figure:
         "held-out motion, so the level without filter contains more noise: compare how the errors grow with the rate."
     )
     finding = "With the filter's gain the error grows at 30 deg/s, and more where it runs twice"
-    figure = Figure("speed", finding, caption, _legend(FILTERS.values()))
+    figure = Figure("speed", finding, caption, _legend(FILTER_NAMES.values()))
     return curves(figure, points, "mean |e| after, g", "rate, deg/s", named=False)
 
 

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 
 FOUND = ("O_y", "O_z", "M", "b_x", "b_y", "b_z", "S_x", "S_y", "S_z")
-COLUMNS = ("set", "seed", "cause", "method", *FOUND, "error")
+SEED_COLUMNS = ("set", "seed", "cause", "method", *FOUND, "error")
 TIME_CONSTANT_S = 0.12  # of campaign.yaml
 INTERVAL_S = 0.12  # of simulation.yaml
 SAME_GAIN_S = (np.sqrt(INTERVAL_S**2 + 2.0 * TIME_CONSTANT_S * (INTERVAL_S + TIME_CONSTANT_S)) - INTERVAL_S) / 2.0
@@ -67,7 +67,7 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Set:
+class RecordingSet:
     """One set of recordings of ``simulation.yaml``: its description, its number there, and the campaign's seed."""
 
     unit: UnitDescription
@@ -75,7 +75,7 @@ class Set:
     campaign_seed: int
 
     @classmethod
-    def named(cls, description: Description, name: str) -> Set:
+    def named(cls, description: Description, name: str) -> RecordingSet:
         """Return the set with a name."""
         number = [u.unit for u in description.units].index(name)
         return cls(description.units[number], number, description.seed)
@@ -135,7 +135,7 @@ def _exact(unit: UnitDescription, seed: int, number: int) -> list[Recording]:
 class Drawn:
     """The turns of one seed and the held-out motion of its device, with the same filter on both."""
 
-    turns_set: Set
+    turns_set: RecordingSet
     seed: int
     held_out: Recording
     cause: str = LOST
@@ -161,7 +161,7 @@ class Drawn:
         estimator = accelerometer.Estimator.of(self.turns(), self._settings(as_printed=as_printed))
         found: dict[str, float] = {}
         chain = accelerometer.CorrectedForces()
-        for name in accelerometer.STAGES:
+        for name in accelerometer.STAGE_EQUATIONS:
             chain = estimator.after([name], chain)
             found |= {k: v for k, (v, _) in chain.values.items()}
         row = {f"b_{a}": found[f"b_{a}"] for a in AXES}
@@ -197,7 +197,7 @@ class Drawn:
         bias = found.theta[0]
         A = cholesky_lu.forward_of(turns, bias, settings.table).A
         matrices = {
-            "staged": gyroscope.follow(found.response, list(gyroscope.STAGES)).contract()[1],
+            "staged": gyroscope.follow(found.response, list(gyroscope.STAGE_EQUATIONS)).contract()[1],
             "cholesky-printed": cholesky_lu.calibration_matrix(A, as_printed=True),
             "cholesky": cholesky_lu.calibration_matrix(A, as_printed=False),
         }
@@ -211,8 +211,8 @@ class Drawn:
 def study_of(campaign: Path, seeds: Sequence[int], name: str) -> list[Row]:
     """Return the rows of a set of recordings of the campaign's ``simulation.yaml``."""
     description = read_description(campaign / "simulation.yaml")
-    turns_set = Set.named(description, name)
-    held_out = Set.named(description, f"{device_of(name)}-held-out-{turns_set.sensor}")
+    turns_set = RecordingSet.named(description, name)
+    held_out = RecordingSet.named(description, f"{device_of(name)}-held-out-{turns_set.sensor}")
     rows = []
     for seed in seeds:
         recording, kept = held_out.drawn(seed)[0]

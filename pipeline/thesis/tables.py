@@ -28,17 +28,18 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
+    from pipeline.files import JSON
+
     Cells = Iterator[tuple[Any, ...]]
 
-JSON = dict[str, Any]
 AXES = "xyz"
 DEVICES = {"mpu6050-1": "MPU6050 (1)", "mpu6050-2": "MPU6050 (2)", "stim300": "STIM300"}
-TABLES = {"acutronic": "precise table", "mark2": "home-made table"}
+TABLE_WORDS = {"acutronic": "precise table", "mark2": "home-made table"}
 STOPS = ("stop-1s", "stop-5s", "stop-10s")
 CONTINUOUS = tuple(f"continuous-{rate}dps" for rate in ("0.5", "1", "5", "10", "30"))
 RATES = tuple(f"gyro-{rate}dps" for rate in (20, 60, 80, 100, 200))
 SILENT = Noise(np.zeros(3), np.zeros(3), 100.0, "none")  # mean errors do not depend on the noise
-COLUMNS = ("table", "title", "block", "row", "column", "printed", "ours", "digits")
+TABLE_COLUMNS = ("table", "title", "block", "row", "column", "printed", "ours", "digits")
 LARGE = 0.25  # of the printed value: the page explains a larger difference
 ACCELEROMETER = {
     "as printed: the largest and smallest samples": "printed",
@@ -52,9 +53,9 @@ METRICS = {
     "min_error": "smallest e",
 }
 APPLIED = "by the printed parameters, applied to our held-out motion"
-STAGES = {"O": "orthogonality", "M": "misalignment", "b": "bias", "S": "scale_factor"}
+STAGE_OF_LETTER = {"O": "orthogonality", "M": "misalignment", "b": "bias", "S": "scale_factor"}
 # The comparison of methods: its two methods, for the thesis as printed and with errata corrected.
-COMPARED = {
+COMPARED_FIGURES = {
     "accelerometer": {
         "by the staged method as printed": ("printed", "least-squares"),
         "by the staged method with its errata corrected": ("staged", "least-squares"),
@@ -74,11 +75,11 @@ SEGMENT_DEG = 45.0  # the paper turns in steps of 45 deg
 
 # By sensor: file of the printed parameters, our methods, and rows. A row: label, column of the file, stage, and the
 # parameters whose mean is compared (both sides of a factor).
-PARAMETERS: dict[str, tuple[str, dict[str, str], list[tuple[str, str, str, list[str]]]]] = {
+PARAMETER_TABLES: dict[str, tuple[str, dict[str, str], list[tuple[str, str, str, list[str]]]]] = {
     "accelerometer": ("accel_parameters", ACCELEROMETER, [
         (f"{q}{a}{', g' if q == 'b' else ''}", f"{q}_{a}{'_g' if q == 'b' else ''}", stage,
          [f"b_{a}"] if q == "b" else [f"{q}_P_{a}", f"{q}_N_{a}"])
-        for q, stage in STAGES.items() for a in AXES
+        for q, stage in STAGE_OF_LETTER.items() for a in AXES
     ]),
     "gyroscope": ("gyro_parameters", GYROSCOPE, [
         *((f"b{a}, deg/s", f"b_{a}_dps", "bias", [f"b_{a}"]) for a in AXES),
@@ -200,7 +201,7 @@ def all_tables(printed: Path, results: Results) -> pd.DataFrame:
     """Return the cells of tables 5.1 to 5.26, then of the paper's tables."""
     tables = (_parameter_tables, _error_tables, _method_tables)
     cells = sorted((c for t in tables for c in t(printed, results)), key=lambda c: int(c[0].partition(".")[2]))
-    return with_differences(pd.DataFrame([*cells, *_paper_tables(printed, results)], columns=list(COLUMNS)))
+    return with_differences(pd.DataFrame([*cells, *_paper_tables(printed, results)], columns=list(TABLE_COLUMNS)))
 
 
 def with_differences(cells: pd.DataFrame) -> pd.DataFrame:
@@ -223,12 +224,12 @@ def _cells(
 
 
 def _title(what: str, rows: pd.DataFrame) -> str:
-    return f"{what} of {DEVICES[rows['device'].iloc[0]]}, {TABLES[rows['rate_table'].iloc[0]]}"
+    return f"{what} of {DEVICES[rows['device'].iloc[0]]}, {TABLE_WORDS[rows['rate_table'].iloc[0]]}"
 
 
 def _parameter_tables(printed: Path, results: Results) -> Cells:
     """Yield the cells of tables 5.1 to 5.7 and 5.15 to 5.18."""
-    for sensor, (file, methods, quantities) in PARAMETERS.items():
+    for sensor, (file, methods, quantities) in PARAMETER_TABLES.items():
         for table, rows in read_printed(printed, file).groupby("table", sort=False):
             title, columns = _title(f"{sensor.capitalize()}: parameters", rows), rows["procedure"].map(in_words)
             for block, method in methods.items():
@@ -239,14 +240,14 @@ def _parameter_tables(printed: Path, results: Results) -> Cells:
 
 def _error_tables(printed: Path, results: Results) -> Cells:
     """Yield the cells of tables 5.8 to 5.14 and 5.19 to 5.22."""
-    files = (read_printed(printed, name).to_dict("records") for name, *_ in PARAMETERS.values())
+    files = (read_printed(printed, name).to_dict("records") for name, *_ in PARAMETER_TABLES.values())
     parameters = {row["set"]: row for rows in files for row in rows}
     for table, rows in read_printed(printed, "errors").groupby("table", sort=False):
         sensor, unit = rows["sensor"].iloc[0], rows["unit"].iloc[0]
         title, by_metric = _title(f"{sensor.capitalize()}: held-out error", rows), dict(iter(rows.groupby("metric")))
         sets = by_metric["mean_abs_error"]["set"]
         columns = by_metric["mean_abs_error"]["procedure"].map(in_words)
-        for block, method in PARAMETERS[sensor][1].items():
+        for block, method in PARAMETER_TABLES[sensor][1].items():
             for metric, label in METRICS.items():
                 found = [results.errors(f"{s}-{method}", sensor, metric) for s in sets]
                 names = (f"{label}, {unit}: before", f"{label}, {unit}: after", f"{label}: change, %")
@@ -266,7 +267,7 @@ def _method_tables(printed: Path, results: Results) -> Cells:
         procedure = "stop-1s" if sensor == "accelerometer" else "gyro-20dps"
         # the STIM300's errors are from continuous 0.5 deg/s (erratum 5)
         other = {"stim300": "continuous-0.5dps"} if sensor == "accelerometer" else {}
-        for block, (staged, method) in COMPARED[sensor].items():
+        for block, (staged, method) in COMPARED_FIGURES[sensor].items():
             units = [
                 (d, staged if m == "staged" else method) for d, m in zip(rows["device"], rows["method"], strict=True)
             ]

@@ -24,7 +24,7 @@ from pipeline.model.effects.mounting import SEPARATOR, Mounting
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion
 from pipeline.model.measurement import SensorEffects, linear_truth, solve
 from pipeline.records import FittedEffect, Motion, SensorCalibration, StepErrors, Values, corrected
-from pipeline.validation.samples import OTHER, Samples
+from pipeline.validation.samples import OTHER_SENSOR, Samples
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -120,7 +120,7 @@ def _lack(fitted: FittedEffect, samples: Samples) -> str | None:
         return "the held-out recording holds no temperature"
     signal_of_other = "angular_rate" if samples.sensor == "accelerometer" else "specific_force"
     if signal_of_other in used and samples.other is None and not samples.resting:
-        return f"the held-out recording holds no {OTHER[samples.sensor]}"
+        return f"the held-out recording holds no {OTHER_SENSOR[samples.sensor]}"
     return None
 
 
@@ -192,7 +192,7 @@ def _by_calibrated_log(calibration: SensorCalibration, effects: Sequence[FittedE
     sensor = calibration.sensor
     readings = {sensor: samples.reading}
     if samples.other is not None:
-        readings[OTHER[sensor]] = samples.other
+        readings[OTHER_SENSOR[sensor]] = samples.other
     used = fields_used(sensor, effects)
     nothing = np.zeros_like(samples.reading)
 

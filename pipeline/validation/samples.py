@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from pipeline.settings import Settings, Table
     from pipeline.signal.rests import Rest
 
-OTHER = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}
+OTHER_SENSOR = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}
 UNCALIBRATED_ERROR = 0.05  # of scale and axes before calibration: scale 3 %, cross-axis 2 % (data sheets)
 OFF_AXIS_SHARE = 0.03  # of the rate about one axis; cross-axis sensitivity of data sheets, and effects, cause less
 NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(48)  # enough for the 0.4 % of a simulation (test_norm_error)
@@ -167,7 +167,7 @@ class HeldOutCase:
         if not rests:
             return None
         reading, counts = reading[counts > 0], counts[counts > 0]
-        other, _ = rest_means(recording, rests, OTHER[sensor])
+        other, _ = rest_means(recording, rests, OTHER_SENSOR[sensor])
         share, own = variances_of_means(recording, counts, sensor)
         averaged = variance_of_average(counts.astype(np.float64) * recording.interval, noise.correlation_time)
         white = share[:, None] * noise.white**2 + own[:, None]
@@ -241,7 +241,7 @@ def samples_of_motion(
         white,
         np.broadcast_to(_wander_gain(recording) * noise.wander**2, (n, 3)),
         motion,
-        _truth_of_other(recording.reading(OTHER[sensor]), other),
+        _truth_of_other(recording.reading(OTHER_SENSOR[sensor]), other),
         recording.temperature if motion is None else motion.temperature,
         correlated_samples=float((2.0 * squares.sum() - squares[0]) / squares[0]),  # sum of r_l^2 / r_0^2 over lags l
         setup=recording.setup,

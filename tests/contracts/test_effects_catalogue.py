@@ -140,7 +140,7 @@ def test_the_rows_of_the_table_of_theory_are_those_of_the_files() -> None:
 def test_one_file_adds_an_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, motions: list[Motion]) -> None:
     shutil.copytree(CONFIGS, tmp_path / "effect")
     (tmp_path / "effect" / "rate_product.yaml").write_text(RATE_PRODUCT, encoding="utf-8")
-    monkeypatch.setattr(effects, "FOLDER", tmp_path / "effect")
+    monkeypatch.setattr(effects, "EFFECTS_FOLDER", tmp_path / "effect")
     built_in_files.cache_clear()
     try:
         made = catalogue()["rate_product"]

@@ -11,14 +11,14 @@ from unit_settings import settings_of, with_noise
 from pipeline.diagnosis.findings import DiagnosisInput
 from pipeline.diagnosis.method_errors import given_differences
 from pipeline.diagnosis.multi_position import _model_of_all_rests
-from pipeline.diagnosis.verdict import HeldOut, VerdictInput, decide, judged
+from pipeline.diagnosis.verdict import HeldOutError, VerdictInput, decide, judged
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.stages import fit_stage
 from pipeline.records import Recording, SensorCalibration, SensorDiagnosis, StageResult
 from pipeline.verdicts import Verdict
 
-ABOVE = HeldOut(0.5, 0.01, 0.1)
+ABOVE = HeldOutError(0.5, 0.01, 0.1)
 GIVEN = VerdictInput("gyroscope", "nothing_missing", over_noise=0.9, published=ABOVE, method="given", on_table=False)
 FREE = SensorCalibration(
     "gyroscope", np.array([1.0, -2.0, 0.5]), np.diag([1.01, 0.99, 1.02]), covariance=np.eye(12) * 1e-8
@@ -74,7 +74,7 @@ def test_the_given_calibration_is_blamed_where_a_fit_of_the_recordings_leaves_no
     assert reason.endswith("the given calibration causes the error.")
     assert decide(replace(GIVEN, method="rests_and_moves"))[0] == "reference_in_doubt"
     assert decide(replace(GIVEN, over_noise=4.0))[0] == "unexplained"
-    inside = replace(GIVEN, published=HeldOut(0.05, 0.01, 0.1))
+    inside = replace(GIVEN, published=HeldOutError(0.05, 0.01, 0.1))
     assert decide(inside) == ("nothing_missing", "")
     assert decide(replace(inside, approximations=("bias",)))[0] == "left_by_method"
 

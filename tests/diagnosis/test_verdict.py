@@ -9,18 +9,18 @@ import pytest
 from bench_session import Session, record
 
 from pipeline.diagnosis.diagnose import doubts_of, held_out_of
-from pipeline.diagnosis.verdict import HeldOut, VerdictInput, decide, judged, verdict_of_selection
+from pipeline.diagnosis.verdict import HeldOutError, VerdictInput, decide, judged, verdict_of_selection
 from pipeline.estimation.stages import declared
 from pipeline.one_unit import unit_of_recordings
 from pipeline.outcome import commands_of
-from pipeline.records import Agreement, Dependence, HeldOutErrors, Note, Recording, SensorDiagnosis, StepErrors
+from pipeline.records import Agreement, Dependence, Note, Recording, SelectionErrors, SensorDiagnosis, StepErrors
 from pipeline.report.parameters import summary_row
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import draw
 from pipeline.verdicts import Verdict
 from tests.published import TESTED, candidate
 
-INSIDE, ABOVE, BELOW = HeldOut(1.0, 0.9, 1.2), HeldOut(9.0, 0.9, 1.2), HeldOut(0.5, 0.9, 1.2)
+INSIDE, ABOVE, BELOW = HeldOutError(1.0, 0.9, 1.2), HeldOutError(9.0, 0.9, 1.2), HeldOutError(0.5, 0.9, 1.2)
 REFERENCE, OF_STAGED, OF_HAND = (
     {"method": method, "fit": declared("gyroscope", stage)}
     for method, stage in [
@@ -39,8 +39,8 @@ OFF = Agreement(p_value=1e-5, reads="x", of="y", error=3e-4, expanded_uncertaint
 BEYOND = replace(MISSING, implausible=("g_sensitivity",))
 
 
-def held_out(after: float) -> HeldOutErrors:
-    return HeldOutErrors(1.0, after, 0.3)
+def held_out(after: float) -> SelectionErrors:
+    return SelectionErrors(1.0, after, 0.3)
 
 
 @pytest.mark.parametrize(

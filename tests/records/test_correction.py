@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ConfigurationError
-from pipeline.records.correction import Step, TwoSided, corrected, published, steps_of
+from pipeline.records.correction import CorrectionStep, TwoSided, corrected, published, steps_of
 
 
-def read(correction: dict[str, Any]) -> tuple[Step, ...]:
+def read(correction: dict[str, Any]) -> tuple[CorrectionStep, ...]:
     steps = steps_of(correction)
     assert steps is not None
     return steps

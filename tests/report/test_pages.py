@@ -19,7 +19,7 @@ from pipeline.report import campaign_page
 from pipeline.report.certificate import certificate, certificate_page
 from pipeline.report.chart import Figure, Panel, SampleMarks, chart
 from pipeline.report.fleet import parameter_table, write_summary
-from pipeline.report.parameters import COLUMNS, summary_row, unit_parameters
+from pipeline.report.parameters import SUMMARY_COLUMNS, summary_row, unit_parameters
 from pipeline.report.unit_page import render
 from pipeline.settings import Certificate, Stated
 from pipeline.simulation.description import shipped_settings
@@ -164,7 +164,7 @@ def test_the_summary_has_the_columns_that_scripts_rely_on(unit: Unit, tmp_path: 
     write_summary(tmp_path / "summary.csv", rows(unit, 2))
     read = list(csv.DictReader((tmp_path / "summary.csv").read_text().splitlines()))
     assert tuple(read[0])[:8] == ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
-    assert tuple(read[0]) == (*COLUMNS, "colour")
+    assert tuple(read[0]) == (*SUMMARY_COLUMNS, "colour")
     assert float(read[1]["accelerometer_error_after"]) == 0.0031
     assert read[1]["gyroscope_verdict"] == unit.diagnosis["gyroscope"]["verdict"]
     assert read[1]["colour"] == "red"

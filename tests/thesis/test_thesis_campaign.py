@@ -10,8 +10,8 @@ import pytest
 from unit_settings import settings_of, with_noise
 
 from pipeline.config import load_campaign
-from pipeline.estimation.accelerometer.staged import STAGES as OF_ACCELEROMETER
-from pipeline.estimation.gyroscope.staged import STAGES as OF_GYROSCOPE
+from pipeline.estimation.accelerometer.staged import STAGE_EQUATIONS as OF_ACCELEROMETER
+from pipeline.estimation.gyroscope.staged import STAGE_EQUATIONS as OF_GYROSCOPE
 from pipeline.estimation.stages import fit_stage
 from pipeline.model.measurement import linear_truth
 from pipeline.records import Recording, SensorCalibration, coverage_factor

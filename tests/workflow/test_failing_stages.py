@@ -210,7 +210,7 @@ def test_a_run_with_failed_units_ends_with_1_and_names_each(
 
 def contents(results: Path) -> dict[str, bytes]:
     """Return every published file."""
-    files = [results / name for name in results_folder.PUBLISHED if "." in name]
+    files = [results / name for name in results_folder.PUBLISHED_PATHS if "." in name]
     files += [f for folder in FOLDERS for f in (results / folder).rglob("*") if f.is_file()]
     return {str(f.relative_to(results)): f.read_bytes() for f in files}
 
@@ -219,7 +219,7 @@ def test_the_published_files_are_those_of_one_run_wherever_it_is_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def make(name: str, folder: Path) -> None:
-        for published in results_folder.PUBLISHED:
+        for published in results_folder.PUBLISHED_PATHS:
             path = folder / published / "U1.json" if "." not in published else folder / published
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(f"{name} {published}")
@@ -259,7 +259,7 @@ def test_the_published_files_are_those_of_one_run_wherever_it_is_stopped(
         assert contents(results) == (new if begun else old)
         assert not (results / results_folder.COMPLETE).exists()
     assert contents(results) == new
-    assert stop > len(results_folder.PUBLISHED)
+    assert stop > len(results_folder.PUBLISHED_PATHS)
 
 
 def keep_the_first_rest(file: Path) -> None:

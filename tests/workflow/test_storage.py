@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.results_folder import PUBLISHED
+from pipeline.results_folder import PUBLISHED_PATHS
 
 ROOT = Path(__file__).parents[2]
 PLUGINS = ("snakemake_storage_plugin_fs", "snakemake_executor_plugin_cluster_generic")
@@ -43,7 +43,7 @@ pytestmark = [
 
 def published(results: Path) -> dict[str, str]:
     """Return the digest of every published file."""
-    files = [f for name in PUBLISHED for f in [results / name, *(results / name).rglob("*")] if f.is_file()]
+    files = [f for name in PUBLISHED_PATHS for f in [results / name, *(results / name).rglob("*")] if f.is_file()]
     return {str(f.relative_to(results)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
 
 

@@ -88,14 +88,16 @@ if TYPE_CHECKING:
 
 NAME = "nonlinear_least_squares"
 FIT_STAGES = {NAME: FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("bias", "matrix"), free=True)}
-ROWS, COLUMNS = np.tril_indices(3)
+LOWER_ROWS, LOWER_COLUMNS = np.tril_indices(3)
 TRIANGLE = slice(BIAS.stop, None)  # of the nine values: the elements of L; the bias comes first
-PLACE = np.arange(BASE_COUNT)[[*range(BIAS.stop), *(MATRIX.start + np.ravel_multi_index((ROWS, COLUMNS), (3, 3)))]]
+PLACE = np.arange(BASE_COUNT)[
+    [*range(BIAS.stop), *(MATRIX.start + np.ravel_multi_index((LOWER_ROWS, LOWER_COLUMNS), (3, 3)))]
+]
 PLACED = np.eye(BASE_COUNT)[:, PLACE]
-ELEMENTS = [(AXES[i], AXES[j]) for i, j in zip(ROWS, COLUMNS, strict=True)]
+ELEMENTS = [(AXES[i], AXES[j]) for i, j in zip(LOWER_ROWS, LOWER_COLUMNS, strict=True)]
 PARAMETER_NAMES = np.array(PARAMETERS)
-MISALIGNMENT = np.concatenate([np.zeros(3, bool), ROWS != COLUMNS])
-IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])  # the nine values of an ideal sensor
+MISALIGNMENT = np.concatenate([np.zeros(3, bool), LOWER_ROWS != LOWER_COLUMNS])
+IDEAL = np.concatenate([np.zeros(3), np.eye(3)[LOWER_ROWS, LOWER_COLUMNS]])  # the nine values of an ideal sensor
 # standard uncertainty, g or relative, beyond which a bias or scale factor is called undetermined
 MAX_KNOWN_UNCERTAINTY = 0.05
 FALSE_ALARM = 1e-3  # probability that a recording without outliers has one
@@ -173,7 +175,7 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
 def triangle(values: Values) -> Values:
     """Return L of the nine values: (3, 3) array."""
     L = np.zeros((3, 3))
-    L[ROWS, COLUMNS] = values[TRIANGLE]
+    L[LOWER_ROWS, LOWER_COLUMNS] = values[TRIANGLE]
     return L
 
 
@@ -308,7 +310,7 @@ def _start(y: Values, gravity_g: float, *, tilted: bool) -> Values:
     b = -np.linalg.solve(Q, p[-3:])
     scaled = Q * gravity_g**2 / (1.0 + b @ Q @ b)
     reverse = np.linalg.cholesky(scaled[::-1, ::-1])[::-1, ::-1]  # upper triangular U with U U^T = L^T L
-    return np.concatenate([b, reverse.T[ROWS, COLUMNS]])
+    return np.concatenate([b, reverse.T[LOWER_ROWS, LOWER_COLUMNS]])
 
 
 def _outlier(rows: Orientations, solved: _Solved) -> dict[int, str]:
@@ -391,7 +393,7 @@ def _on_table(
 def _parameters(solved: _Solved, covariance: Values) -> dict[str, Estimate]:
     """Return b, S and T with their uncertainties; ``L_ij = T_ij S_j``."""
     values = base_values(solved.fit.state.bias, solved.fit.state.matrix)[PLACE]
-    S, J = np.diag(solved.fit.state.matrix)[COLUMNS], np.eye(9)
+    S, J = np.diag(solved.fit.state.matrix)[LOWER_COLUMNS], np.eye(9)
     L, of_L = values[TRIANGLE], J[TRIANGLE, TRIANGLE]
     for k, (i, j) in enumerate(ELEMENTS):
         if i != j:

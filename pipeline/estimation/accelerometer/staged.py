@@ -57,10 +57,10 @@ from pipeline.records import (
     BASE,
     BASE_COUNT,
     Contribution,
+    CorrectionStep,
     FittedEffect,
     Recording,
     SensorCalibration,
-    Step,
     Subtract,
     TwoSided,
     Values,
@@ -72,7 +72,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     Quantities = dict[str, tuple[float, str]]  # value and unit of each parameter
-    Outcome = tuple[list[Step], Quantities]  # steps of the correction by a stage, and its parameters
+    Outcome = tuple[list[CorrectionStep], Quantities]  # steps of the correction by a stage, and its parameters
     from pipeline.records import UnitRecordings
     from pipeline.settings import Settings
 
@@ -177,14 +177,14 @@ def scale_factor(extremes: Extremes) -> Outcome:
     G, a_max, a_min, a_zero = extremes.gravity_g, extremes.a_max, extremes.a_min, extremes.a_zero
     if extremes.as_printed:
         positive, negative = G / a_max - a_zero, G / np.abs(a_min) - a_zero
-        steps: list[Step] = [Subtract(a_zero), TwoSided(positive, negative, np.zeros(3))]
+        steps: list[CorrectionStep] = [Subtract(a_zero), TwoSided(positive, negative, np.zeros(3))]
     else:
         positive, negative = G / (a_max - a_zero), G / np.abs(a_min - a_zero)
         steps = [TwoSided(positive, negative, a_zero)]
     return steps, _per_axis("S_P", positive, "1") | _per_axis("S_N", negative, "1")
 
 
-STAGES = {f.__name__: f for f in (orthogonality, misalignment, bias, scale_factor)}
+STAGE_EQUATIONS = {f.__name__: f for f in (orthogonality, misalignment, bias, scale_factor)}
 FIT_STAGES = {
     "orthogonality": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("matrix",)),
     "misalignment": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("matrix",)),
@@ -197,7 +197,7 @@ FIT_STAGES = {
 class CorrectedForces:
     """The output of a stage: the correction so far in both forms, and the parameters of the last stage."""
 
-    steps: list[Step] = field(default_factory=list)
+    steps: list[CorrectionStep] = field(default_factory=list)
     bias: Values = field(default_factory=lambda: np.zeros(3))
     positive: Values = field(default_factory=lambda: np.ones(3))
     negative: Values = field(default_factory=lambda: np.ones(3))
@@ -222,12 +222,12 @@ class CorrectedForces:
         """Half the difference of both sides: (3,) array."""
         return (1.0 / self.positive - 1.0 / self.negative) / 2.0
 
-    def after(self, step: Step, *, averaged: bool) -> CorrectedForces:
+    def after(self, step: CorrectionStep, *, averaged: bool) -> CorrectedForces:
         """Return the correction after a further step; ``averaged``: the factors of both sides are averaged."""
         steps = [*self.steps, step]
         if isinstance(step, Subtract):
             return replace(self, steps=steps, bias=self.bias + step.offset * self.k)
-        assert isinstance(step, TwoSided)  # noqa: S101  (``STAGES``)
+        assert isinstance(step, TwoSided)  # noqa: S101  (``STAGE_EQUATIONS``)
         positive, negative = step.positive, step.negative
         if averaged:
             positive = negative = (positive + negative) / 2.0
@@ -248,7 +248,7 @@ def follow(extremes: Extremes, names: Sequence[str], start: CorrectedForces | No
     for step in found.steps:
         extremes = extremes.corrected(step)
     for name in names:
-        steps, values = STAGES[name](extremes)
+        steps, values = STAGE_EQUATIONS[name](extremes)
         for step in steps:
             extremes = extremes.corrected(step)
             found = found.after(step, averaged=name != "scale_factor")

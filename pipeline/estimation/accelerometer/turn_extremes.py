@@ -39,7 +39,7 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.least_squares import ScaledColumns, certificate, certified
 from pipeline.estimation.turns import TurnPart, filtered_alike
-from pipeline.records import AXES, Mask, Step, TwoSided, Values
+from pipeline.records import AXES, CorrectionStep, Mask, TwoSided, Values
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -93,7 +93,7 @@ class Extremes:
         """alpha_N, beta_N, gamma_N: the same of the lower extremes."""
         return wrap(self.angle_low[:, 0] - self.angle_low[:, 1] - 90.0)
 
-    def corrected(self, step: Step) -> Self:
+    def corrected(self, step: CorrectionStep) -> Self:
         """Return the extremes of readings after a step of a correction."""
 
         def apply(values: Values) -> Values:

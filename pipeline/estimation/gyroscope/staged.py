@@ -38,11 +38,11 @@ from pipeline.records import (
     AFTER_BASE,
     AXES,
     BASE,
+    CorrectionStep,
     Mask,
     Multiply,
     Recording,
     SensorCalibration,
-    Step,
     Subtract,
     Values,
     corrected,
@@ -107,7 +107,7 @@ def scale_factor(response: Response) -> Outcome:
     return Multiply(np.asarray(np.diag(scale), np.float64)), values
 
 
-STAGES = {f.__name__: f for f in (bias, orthogonality_and_misalignment, scale_factor)}
+STAGE_EQUATIONS = {f.__name__: f for f in (bias, orthogonality_and_misalignment, scale_factor)}
 FIT_STAGES = {
     "bias": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias",)),
     "orthogonality_and_misalignment": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("matrix",)),
@@ -119,7 +119,7 @@ FIT_STAGES = {
 class CorrectedRates:
     """The output of a stage: the correction so far, and the parameters of the last stage."""
 
-    steps: list[Step] = field(default_factory=list)
+    steps: list[CorrectionStep] = field(default_factory=list)
     values: dict[str, tuple[float, str]] = field(default_factory=dict)
 
     def contract(self) -> tuple[Values, Values]:
@@ -139,7 +139,7 @@ class CorrectedRates:
         return np.concatenate([offset, matrix.ravel(), [value for value, _ in self.values.values()]])
 
 
-def follow(response: Response, names: Sequence[str], start: Sequence[Step] = ()) -> CorrectedRates:
+def follow(response: Response, names: Sequence[str], start: Sequence[CorrectionStep] = ()) -> CorrectedRates:
     """Run stages one after the other, each on the output of the one before.
 
     ``start``: the correction by the stages before the first of ``names``.
@@ -148,7 +148,7 @@ def follow(response: Response, names: Sequence[str], start: Sequence[Step] = ())
     for step in found.steps:
         response = response.after(step)
     for name in names:
-        step, values = STAGES[name](response)
+        step, values = STAGE_EQUATIONS[name](response)
         response = response.after(step)
         found = CorrectedRates([*found.steps, step], values)
     return found
@@ -234,11 +234,11 @@ class Response:
     rate: Values  # (3,), deg/s; I: mean magnitude of the rate about each axis; 0 where none was recorded
     as_printed: bool = False  # whether the equations are those that are printed
 
-    def after(self, step: Step) -> Response:
+    def after(self, step: CorrectionStep) -> Response:
         """Return the response of readings after a step of a correction."""
         if isinstance(step, Subtract):
             return replace(self, rest=self.rest - step.offset)
-        assert isinstance(step, Multiply)  # noqa: S101  (``STAGES``)
+        assert isinstance(step, Multiply)  # noqa: S101  (``STAGE_EQUATIONS``)
         return replace(self, rest=step.matrix @ self.rest, slope=self.slope @ step.matrix.T)
 
     def require_turns(self) -> None:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pipeline.records import FittedEffect
     from pipeline.settings import Table, UserEffectFiles
 
-FOLDER = CONFIGS / "effect"
+EFFECTS_FOLDER = CONFIGS / "effect"
 BUILT_IN = re.compile(r"^built_in: true", re.MULTILINE)
 MAX_EFFECT_BYTES, MAX_EFFECT_VALUES = 16384, 1000  # of one file; the largest built-in one has 2 kB and 70 values
 OF_PYTHON = ("name", "owner", "layout", "meaning", "excitation", "experiment", "source")
@@ -172,7 +172,7 @@ def _defined(definition: str) -> Effect:
 @cache
 def built_in_files() -> dict[str, Path]:
     """Return the file of each built-in effect, by name; a user's file in the same folder is none."""
-    files = sorted(FOLDER.glob("*.yaml"))
+    files = sorted(EFFECTS_FOLDER.glob("*.yaml"))
     return {f.stem: f for f in files if BUILT_IN.search(f.read_text(encoding="utf-8", errors="replace"))}
 
 

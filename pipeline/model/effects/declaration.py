@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 
-NAME = re.compile(r"[a-z][a-z0-9_]{0,49}")
+EFFECT_NAME = re.compile(r"[a-z][a-z0-9_]{0,49}")
 TERM = re.compile(r"[A-Za-z](?=.{0,19}$)[A-Za-z0-9_]*\*?[A-Za-z0-9_]*")
 RESERVED = ("auto", "all", "none")
 MOST_TERMS, LONGEST_TEXT, LONGEST_UNIT = 12, 500, 30  # above every built-in effect; they limit pages and fits
@@ -140,7 +140,7 @@ def _line(longest: int) -> Check:
 
 
 def _name(given: object) -> str:
-    if not isinstance(given, str) or not NAME.fullmatch(given) or given in RESERVED:
+    if not isinstance(given, str) or not EFFECT_NAME.fullmatch(given) or given in RESERVED:
         raise WrongValueError(f"{given!r} is no name of an effect; use small letters, digits and _, at most 50")
     return given
 

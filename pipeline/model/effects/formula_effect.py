@@ -31,7 +31,7 @@ AS_DECLARED = (
     *("experiment_by_hand", "source", "typical_share", "proposed", "shown_by"),
 )
 OF_THE_TURN = ("angle", "rate")
-NEEDED = ("temperature", "angle", "rate", "level")  # fields that a motion may lack
+OPTIONAL_FIELDS = ("temperature", "angle", "rate", "level")  # fields that a motion may lack
 TRUTHS = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
 
 
@@ -71,7 +71,7 @@ class FormulaEffect(DeclaredEffect):
         self._by_axis, self._shared = [t for t in terms if not t.shared], [t for t in terms if t.shared]
         self._names = sorted({signal for term in terms for signal in term.signals})
         fields = {SIGNALS[name].field for name in self._names}
-        self.needs = tuple(field for field in NEEDED if field in fields)
+        self.needs = tuple(field for field in OPTIONAL_FIELDS if field in fields)
         self.needs_clock = "time" in self._names
         self.needs_motion = all(t.signals & OF_THE_MOTION for t in terms)
         if self._shared or declared.axes != AXES:
