@@ -51,7 +51,7 @@ SAME_MEANING = {
 # Names that still have several meanings.
 NOT_YET = {
     "COMMANDS", "Error", "FAILED", "INCOMPLETE", "KINDS", "Kind", "LETTERS", "LISTED", "MOVING", "NARROWEST",
-    "LAST_TURN_DEG", "OF_THE_BIAS", "Problem", "RESTING", "ROW_S", "SENSORS", "SHEET", "WHOLE",
+    "LEAST_TURN_DEG", "OF_THE_BIAS", "Problem", "RESTING", "ROW_S", "SENSORS", "SHEET", "WHOLE",
 }  # fmt: skip
 
 
