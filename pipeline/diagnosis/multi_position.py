@@ -35,8 +35,9 @@ from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
 from pipeline.estimation.least_squares import ScaledColumns, cholesky
 from pipeline.estimation.multi_position.effects import model_of
-from pipeline.estimation.multi_position.fit import FitByHand, fit
-from pipeline.estimation.multi_position.model import MIN_NEW_NORM_SHARE, NoiseHypothesis, project_out
+from pipeline.estimation.multi_position.fit import COMPARED_STEP, FitByHand, fit
+from pipeline.estimation.multi_position.likelihood import CEILING_TO, MIN_NEW_NORM_SHARE, log_likelihoods, project_out
+from pipeline.estimation.multi_position.model import NoiseHypothesis
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import SelectionByHand, posterior
 from pipeline.estimation.noise import noise_of
@@ -46,9 +47,9 @@ from pipeline.records import Dependence, UnitRecordings
 from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.multi_position.model import Model, State
+    from pipeline.estimation.multi_position.model import Equations, Model, State
     from pipeline.records import Mask, Noise, Recording, SensorCalibration
     from pipeline.settings import Settings
 
@@ -77,15 +78,13 @@ def findings(case: DiagnosisInput) -> Findings:
         expected = replace(expected, bias=Setting(ratio, noise.correlation_time))
     with_scatter = replace(expected, scatter=selection.fits[-1].noise.scatter)
     hidden, unknown = not_observable_by_hand(selection, case.modelled), _dependences(selection)
-    chi = [
-        float(np.sum(project_out(model.equations(fit.state), [with_scatter]).residual ** 2)) for fit in selection.fits
-    ]
+    chi = [float(np.sum(project_out(fit.equations, [with_scatter]).residual ** 2)) for fit in selection.fits]
     moving = with_scatter if "slow" in model.rests.kinds else expected  # its accelerations are no missing effect
-    over, left_over = (_over_noise(model, selection.fits[k], moving) for k in (0, -1))
+    over, left_over = (_over_noise(model, selection.fits[k].equations, moving) for k in (0, -1))
     verdict = verdict_of_selection_by_hand(selection.names, unknown, left_over)
-    scores = project_out(model.equations(selection.fits[-1].state), selection.hypotheses).scores()
+    scores = log_likelihoods(selection.fits[-1].equations, selection.hypotheses)
     best = selection.hypotheses[int(np.argmax(scores))]
-    signal = selection.first.signal
+    signal, folds = selection.first.signal, _folds(selection, lambda part: SelectionByHand(part, *given, COMPARED_STEP))
 
     def calibrated(fit: FitByHand) -> SensorCalibration:
         return calibration_of(model, fit, calibration, case.settings)
@@ -112,7 +111,7 @@ def findings(case: DiagnosisInput) -> Findings:
         squares=chi,
         drop_alone=lambda name: float(signal[name] @ signal[name]) if name in signal else 0.0,
         excess=max(chi[0] - (len(selection.fits[0].residual) - selection.fits[0].rank), chi[0] - chi[-1]),
-        held_out=_held_out_errors(selection) if selection.names else [None],
+        held_out=_held_out_errors(selection, folds),
         hidden=hidden,
         unknown=unknown,
         over_noise=over,
@@ -134,7 +133,7 @@ def findings(case: DiagnosisInput) -> Findings:
                 "added_variable": added_variable_of_rests(selection) if selection.names else None,
                 "unexplained": [],
             },
-            "cross_validation": _cross_validation(selection, lambda part: SelectionByHand(part, *given)),
+            "cross_validation": _cross_validation(selection, folds),
         },
     )
 
@@ -211,9 +210,9 @@ def _shares(selection: SelectionByHand, name: str) -> dict[str, float]:
     return {other: min(float(np.sum((shown.T @ signal) ** 2)) / power, 1.0) for other, shown in others.items()}
 
 
-def _over_noise(model: Model, fit: FitByHand, expected: NoiseHypothesis) -> float | None:
+def _over_noise(model: Model, equations: Equations, expected: NoiseHypothesis) -> float | None:
     """Return the rms residual of the rests over that of noise alone; None without a degree of freedom."""
-    equations, rests = model.equations(fit.state), slice(model.rests_equations)
+    rests = slice(model.rests_equations)
     L = cholesky(equations.covariance(expected)[rests, rests])
     columns = np.asarray(np.linalg.solve(L, equations.columns[rests]), np.float64)
     readings = np.asarray(np.linalg.solve(L, equations.residual[rests]), np.float64)
@@ -222,47 +221,51 @@ def _over_noise(model: Model, fit: FitByHand, expected: NoiseHypothesis) -> floa
     return float(np.sqrt(residual @ residual / freedom)) if freedom > 0 else None
 
 
-def _held_out_errors(selection: SelectionByHand) -> list[float | None]:
+def _held_out_errors(selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand, int]]) -> list[float | None]:
     """Return the rms error, g or deg/s, of each fit of the selection on rests that are left out of it in turn."""
     model = selection.model
-    if model.held_out_error(selection.fits[0].state) is not None:  # a recording for validation
-        return [model.held_out_error(each.state) for each in selection.fits]
+    if not folds:  # a recording for validation, or nothing is selected
+        return [model.held_out_error(each.state) for each in selection.fits] if selection.names else [None]
     errors: list[float | None] = []
-    for each in selection.fits:
-        folds = [
-            (part, held, fit(part, each.state, selection.hypotheses, selection.bounds)) for part, held in _folds(model)
+    for k, each in enumerate(selection.fits):
+        fits = [
+            fold.fits[k]
+            if fold.names[:k] == selection.names[:k]
+            else fit(fold.model, each.state, selection.hypotheses, selection.bounds, small=COMPARED_STEP)
+            for fold, _ in folds
         ]
-        judged = all(len(fitted.residual) >= fitted.rank + SPARE for _, _, fitted in folds)
-        square = sum(_squared(part, fitted.state) * held for part, held, fitted in folds) / len(model.rests.time)
-        errors.append(float(np.sqrt(square)) if judged else None)
+        judged = all(len(fitted.residual) >= fitted.rank + SPARE for fitted in fits)
+        squares = (held * _squared(fold.model, fitted.state) for (fold, held), fitted in zip(folds, fits, strict=True))
+        errors.append(float(np.sqrt(sum(squares) / len(model.rests.time))) if judged else None)
     return errors
 
 
-def _cross_validation(selection: SelectionByHand, select: Callable[[Model], SelectionByHand]) -> dict[str, Any] | None:
+def _cross_validation(
+    selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand, int]]
+) -> dict[str, Any] | None:
     """Return the errors of the whole procedure, selection included, on rests that are left out of it in turn.
 
     ``folds``, ``error_before, error_after`` (rms, g or deg/s), and ``named``: the number of folds that selected each
-    effect. None if nothing was selected, or if there is a recording for validation.
+    effect. None if there are no folds.
     """
-    model = selection.model
-    if not selection.names or model.held_out_error(selection.fits[0].state) is not None:
+    if not folds:
         return None
-    named: Counter[str] = Counter()
-    squares = np.zeros(2)
-    for part, held in _folds(model):
-        selected = select(part)
-        named.update(selected.names)
-        squares += held * np.array([_squared(part, selected.fits[k].state) for k in (0, -1)])
-    before, after = np.sqrt(squares / len(model.rests.time)).tolist()
+    named = Counter(name for fold, _ in folds for name in fold.names)
+    squares = [[held * _squared(fold.model, fold.fits[k].state) for k in (0, -1)] for fold, held in folds]
+    before, after = np.sqrt(np.sum(squares, axis=0) / len(selection.model.rests.time)).tolist()
     return {"folds": REST_FOLDS, "error_before": before, "error_after": after, "named": dict(named)}
 
 
-def _folds(model: Model) -> Iterator[tuple[Model, int]]:
-    """Yield the models that leave out every third rest in turn, each with the number of rests left out."""
-    fold = np.arange(len(model.rests.time)) % REST_FOLDS
-    for k in range(REST_FOLDS):
-        held: Mask = fold == k
-        yield model.without(held), int(held.sum())
+def _folds(selection: SelectionByHand, select: Callable[[Model], SelectionByHand]) -> list[tuple[SelectionByHand, int]]:
+    """Return the selections that leave out every third rest in turn, each with the number of rests left out.
+
+    Empty if nothing was selected, or if there is a recording for validation.
+    """
+    model = selection.model
+    if not selection.names or model.held_out_error(selection.fits[0].state) is not None:
+        return []
+    held: list[Mask] = [np.arange(len(model.rests.time)) % REST_FOLDS == k for k in range(REST_FOLDS)]
+    return [(select(model.without(rests)), int(rests.sum())) for rests in held]
 
 
 def _squared(model: Model, state: State) -> float:
@@ -287,13 +290,14 @@ def _dependences(selection: SelectionByHand) -> list[Dependence]:
         definition = effect_from({**effect, "meaning": "Curves."}, "a test of the residual")
         curves.append(EffectColumns(definition, np.zeros(3 * len(formulas))))
     equations = model.equations(selection.fits[-1].state, curves)
-    projected = project_out(equations, selection.hypotheses)
+    possible = selection.ceilings > selection.fits[-1].log_likelihood - CEILING_TO
+    projected = project_out(equations, [selection.hypotheses[i] for i in np.flatnonzero(possible)])
     before, setting = projected.of_model()
     results = []
     for j, (covariate, _) in enumerate(tests):
         count = projected.count(j, setting)
         factor = projected.correction(j, setting, count, equations.scatter) if count else 0.0
-        gain = factor * max(2.0 * (projected.with_candidate(j)[0] - before), 0.0)
+        gain = factor * max(2.0 * (float(projected.with_candidate(j).max()) - before), 0.0)
         delta, p = gain - count * float(np.log(len(equations.residual))), scipy.special.chdtrc(max(count, 1), gain)
         results.append((covariate, delta, float(p)))
     return [Dependence(name, p) for name, (_, p) in significant(results).items()]

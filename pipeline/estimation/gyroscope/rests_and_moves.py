@@ -3,7 +3,7 @@
 At rest the reading is the bias. The integrated rate of a move must rotate gravity before it onto gravity after it. The
 accelerometer is calibrated first, and defines the frame. ``pipeline.estimation.multi_position.gyroscope`` has the
 equations. Rests and moves are weighted by their scatter, and outlying moves have less weight
-(``pipeline.estimation.multi_position.fit``).
+(``pipeline.estimation.multi_position.robust``).
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.multi_position.effects import accelerometer_of
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
-from pipeline.estimation.multi_position.fit import fit_robustly, with_limits
+from pipeline.estimation.multi_position.fit import with_limits
 from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, MOVED, model_of
+from pipeline.estimation.multi_position.likelihood import MIN_NEW_NORM_SHARE
 from pipeline.estimation.multi_position.limits import ONE
-from pipeline.estimation.multi_position.model import MIN_NEW_NORM_SHARE, State, prior_hypotheses
+from pipeline.estimation.multi_position.model import State, prior_hypotheses
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
+from pipeline.estimation.multi_position.robust import fit_robustly
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of
 from pipeline.estimation.stages import FitStage

@@ -126,8 +126,9 @@ class TurnsByHand:
         matrix = np.einsum("rti,tj->rij", self.rows, total).reshape(-1, 9)
 
         def columns(term: EffectColumns) -> Values:
-            Z = term.effect.columns("gyroscope", motion, state.K, term.values).reshape(*self.weight.shape, 3, -1)
-            return np.asarray(-np.einsum("rtc,ts,tscp->rp", WM, self.weight, Z) / error[:, None])
+            Z = term.effect.columns("gyroscope", motion, state.K, term.values)
+            integrals = self.weight[:, None] @ Z.reshape(*self.weight.shape, -1)  # (t, 1, 3 p)
+            return np.asarray(-WM.reshape(len(error), -1) @ integrals.reshape(WM[0].size, -1) / error[:, None])
 
         residual = (self.value - np.einsum("rtc,tc->r", WM, total)) / error
         return EquationBlock(

@@ -1,4 +1,4 @@
-"""Fit base and effects to rests and moves by generalised least squares: Gauss-Newton, robust against single moves.
+"""Fit base and effects to rests and moves by generalised least squares: Gauss-Newton.
 
     step = (N + k P)^-1 (X^T C^-1 r - k P p),    covariance = k (N + k P)^-1,   N = X^T C^-1 X
 
@@ -14,22 +14,14 @@ A few rests do not determine some combinations of parameters: two of the nine cr
 rest, or the amplitude of a warm-up far from its end. So the last fit of plausible effects has a prior with the
 precision P: the sensor file's limits of their parameters p are two standard deviations. P is zero for bias, matrix,
 time constants and parameters without a limit.
-
-A move is an outlier if, with its two whitened residuals r_k and the scale s of the median move,
-
-    t_k = |r_k| / s,   s = median |r_k| / sqrt(2 log 2),   t_k^2 > 2 log(k / p)
-
-which one of k valid moves exceeds with the probability p. If there is an outlier, all moves have the weights
-``min(1, (v + 2) / (v + t^2))`` of Student's t with v = 4 degrees of freedom: a move of weight w has 1/w times its
-variance. Source: Lange, Little & Taylor, JASA 84 (1989), 881-896.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property
 from itertools import product
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -37,59 +29,114 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
 from pipeline.estimation.engine import ErrorMixture
-from pipeline.estimation.least_squares import ScaledColumns, gauss_newton
-from pipeline.estimation.multi_position.model import (
-    MIN_NEW_NORM_SHARE,
-    Equations,
-    Model,
-    NoiseHypothesis,
-    State,
-    project_out,
-    stepped,
-)
+from pipeline.estimation.least_squares import MAX_STEP_HALVINGS
+from pipeline.estimation.multi_position.likelihood import MIN_NEW_NORM_SHARE, NEGLIGIBLE_LOG_LIKELIHOOD, log_likelihoods
+from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, stepped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
-    from pipeline.records import Mask, Recording, Values
+    from pipeline.records import Mask, Values
 
     Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
 
 Fitted = TypeVar("Fitted")
 MAX_GAUSS_NEWTON_ITERATIONS = 60  # of Gauss-Newton
+FAR_ROUNDS = 8  # of simulated fits, from the farthest starts, 99 % need fewer
 SMALL_LAST_STEP = 3e-3  # of a standard uncertainty: the last step taken
+SMALLEST_STEP = 1e-13  # g or deg/s: rounding
+COMPARED_STEP = 0.1  # the same where log L alone is compared, which is then within 0.005 a parameter of its maximum
 STALLED = 0.1  # of a standard uncertainty: a fit whose steps stay larger has not converged
 SAME_SCALE = 1e-4  # relative change of the noise's scale below which the weight of the prior is not changed
-OPEN_SINGULAR_VALUE = 1e-7  # of the largest singular value, below which a combination of parameters takes no step
 UNDETERMINED_COLUMN_SHARE = 1e-8  # share of its columns below which a combination of parameters is not determined
-NEGLIGIBLE_LOG_LIKELIHOOD = 12.0  # of log L below the best: a weight of 6e-6
 SCATTER_FACTORS = (3.0**0.5, 3.0**0.25, 3.0**0.125)  # factors of a scatter, on the way to its maximum
 SHARP = 0.5  # standard deviation of a scatter's logarithm, half a step of the grid
 RARE = 1e-3  # weight of a level below which it does not change the average
-OUTLIER_FALSE_ALARM, FREEDOM = 1e-3, 4.0  # p and v
-ROBUST_ROUNDS, SETTLED_WEIGHT_CHANGE = 6, 0.05  # weights that change by less are final
 
 
 @dataclass(frozen=True)
 class FitByHand:
-    """The best fit to rests and moves."""
+    """The best fit to rests and moves; its covariance is computed where it is used."""
 
     state: State
-    covariance: Values  # (b + p, b + p); of the base parameters along the model's directions, and of the effects'
-    log_likelihood: float
-    noise: NoiseHypothesis  # the most likely one
-    degrees_of_freedom: Values  # (b + p,)
-    # each (n,); residual over the white noise of each equation, and that white noise
-    residual: Values
-    error: Values
-    rank: int  # combinations of parameters that the equations determine
+    equations: Equations  # at the state
+    scores: Values  # log L under each of the given hypotheses; where it is far below the best, by a linear model
     rounds: int
     converged: bool
-    condition: float  # of the whitened columns
     cosine: float  # largest between the whitened residual and a whitened column
-    hypotheses: tuple[tuple[NoiseHypothesis, float, float], ...]  # those of the average, the weight of each, and its k
     precision: Values  # (b + p,); P
+    near: tuple[NoiseHypothesis, ...]  # those of the grid whose likelihood is not negligible
+    alone: bool  # whether one hypothesis was given, which is not refined
+    freedom: float | None  # see ``fit``
+    values: Values  # (b + p,); p
+
+    @property
+    def log_likelihood(self) -> float:
+        """Log L under the most likely of the given hypotheses."""
+        return float(self.scores.max())
+
+    @property
+    def residual(self) -> Values:
+        """Residual over the white noise of each equation: (n,) array."""
+        return self.equations.residual
+
+    @property
+    def error(self) -> Values:
+        """White noise of each equation: (n,) array."""
+        return self.equations.error
+
+    @property
+    def noise(self) -> NoiseHypothesis:
+        """The most likely hypothesis."""
+        return self._every[0][self._likeliest]
+
+    @property
+    def rank(self) -> int:
+        """Number of combinations of parameters that the equations determine."""
+        return self._every[1][self._likeliest].rank
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the whitened columns."""
+        return self._every[1][self._likeliest].condition
+
+    @property
+    def covariance(self) -> Values:
+        """Of the base parameters along the model's directions, and of the effects': (b + p, b + p) array."""
+        return self._averaged[0]
+
+    @property
+    def degrees_of_freedom(self) -> Values:
+        """Of each parameter: (b + p,) array."""
+        return self._averaged[1]
+
+    @property
+    def hypotheses(self) -> list[tuple[NoiseHypothesis, float, float]]:
+        """The hypotheses of the average, the weight of each, and its k."""
+        weights = zip(*self._every, self._weight.tolist(), strict=True)
+        return [(noise, weight, solved.scale) for noise, solved, weight in weights]
+
+    @cached_property
+    def _every(self) -> tuple[list[NoiseHypothesis], list[Solution]]:
+        prior = self.precision, self.values
+        levels = list(self.near) if self.alone else refined(self.equations, self.near, prior)
+        return levels, [solve(self.equations, noise, *prior) for noise in levels]
+
+    @cached_property
+    def _likeliest(self) -> int:
+        return int(np.argmax([solved.log_likelihood for solved in self._every[1]]))
+
+    @cached_property
+    def _weight(self) -> Values:
+        restricted = np.array([solved.restricted for solved in self._every[1]])
+        weight = np.exp(restricted - restricted.max())
+        return np.asarray(weight / weight.sum())
+
+    @cached_property
+    def _averaged(self) -> tuple[Values, Values]:
+        spare = max(len(self.residual) - self.rank, 1) if self.freedom is None else self.freedom
+        covariances = np.array([solved.covariance for solved in self._every[1]])
+        return ErrorMixture(self._weight, covariances, spare).averaged()
 
 
 @dataclass(frozen=True)
@@ -112,74 +159,79 @@ def fit(
     hypotheses: Sequence[NoiseHypothesis],
     limits: Limits,
     freedom: float | None = None,
+    *,
+    known: tuple[Equations, Values] | None = None,
+    small: float = SMALL_LAST_STEP,
 ) -> FitByHand:
     """Fit bias, matrix and effects from given values.
 
     ``freedom``: degrees of freedom of the noise's scale, if other readings determine it; by default of the residuals.
+    ``known``: the equations at the start, and log L under each hypothesis after one step. ``small``: the last step over
+    the standard uncertainty.
     """
     state, rounds, best, scale = start, 0, -1, 0.0
-    evaluated: list[tuple[State, Equations]] = []
-
-    def residual_at(state: State) -> tuple[Values, Values]:
-        equations = model.equations(state)
-        evaluated.append((state, equations))
-        values = np.concatenate([equations.columns, equations.residual[:, None]], axis=1)
-        white = equations.whitened(hypotheses[best], values)[0]
-        precision, parameters = _prior(model, state, limits)
-        rows = np.diag(np.sqrt(scale * precision))[precision > 0.0]
-        return np.append(white[:, -1], -rows @ parameters), -np.concatenate([white[:, :-1], rows])
-
-    def small(step: Values, factors: ScaledColumns) -> bool:
-        uncertainty = np.sqrt(scale * np.diag(factors.covariance()))
-        return bool(np.all(np.abs(step) <= np.maximum(SMALL_LAST_STEP * uncertainty, 1e-13)))
-
+    equations = known[0] if known else model.equations(state)
+    scores = known[1] if known else log_likelihoods(equations, hypotheses)
     while True:
-        equations = next((e for s, e in evaluated if s is state), None) or model.equations(state)
         prior = _prior(model, state, limits)
-        likeliest = project_out(equations, hypotheses).of_model()[1]
+        likeliest = int(np.argmax(scores))
         solved = solve(equations, hypotheses[likeliest], *prior)
         same = not np.any(prior[0]) or abs(solved.scale - scale) <= SAME_SCALE * scale
         if (likeliest == best and same) or rounds > MAX_GAUSS_NEWTON_ITERATIONS // 2:
             break
         best, scale = likeliest, solved.scale
-        evaluated.clear()
-        state, _, more = gauss_newton(
-            residual_at,
-            state,
-            partial(stepped, model),
-            small,
-            MAX_GAUSS_NEWTON_ITERATIONS - rounds,
-            OPEN_SINGULAR_VALUE,
-        )
-        rounds += more
+        state, equations, more = _descended(model, state, equations, hypotheses[best], limits, small)
+        rounds, scores = rounds + more, log_likelihoods(equations, hypotheses, scores)
     uncertainty = np.sqrt(np.diag(solved.covariance))
-    converged = bool(np.all(np.abs(solved.step) <= np.maximum(STALLED * uncertainty, 1e-13)))
-    cosine = solved.cosine  # under the weights of the fit, of which it is the minimum
-    levels, likelihood = refined(equations, hypotheses, prior)
-    every = [solve(equations, noise, *prior) for noise in levels]
-    likeliest = int(np.argmax([s.log_likelihood for s in every]))
-    solved = every[likeliest]
-    restricted = np.array([s.restricted for s in every])
-    weight = np.exp(restricted - restricted.max())
-    weight /= weight.sum()
-    spare = max(len(equations.residual) - solved.rank, 1) if freedom is None else freedom
-    covariance, degrees = ErrorMixture(weight, np.array([s.covariance for s in every]), spare).averaged()
+    near = [h for h, score in zip(hypotheses, scores, strict=True) if score > scores.max() - NEGLIGIBLE_LOG_LIKELIHOOD]
     return FitByHand(
         state=state,
-        covariance=covariance,
-        log_likelihood=likelihood,
-        noise=levels[likeliest],
-        degrees_of_freedom=degrees,
-        residual=equations.residual,
-        error=equations.error,
-        rank=solved.rank,
+        equations=equations,
+        scores=scores,
         rounds=rounds,
-        converged=converged,
-        condition=solved.condition,
-        cosine=cosine,
-        hypotheses=tuple((noise, float(w), s.scale) for noise, w, s in zip(levels, weight, every, strict=True)),
+        converged=bool(np.all(np.abs(solved.step) <= np.maximum(STALLED * uncertainty, SMALLEST_STEP))),
+        cosine=solved.cosine,  # under the weights of the fit, of which it is the minimum
         precision=prior[0],
+        near=tuple(near),
+        alone=len(hypotheses) == 1,
+        freedom=freedom,
+        values=prior[1],
     )
+
+
+def _descended(  # noqa: PLR0917  (what an iteration is)
+    model: Model, state: State, equations: Equations, noise: NoiseHypothesis, limits: Limits, small: float
+) -> tuple[State, Equations, int]:
+    """Return the state after Gauss-Newton steps under one hypothesis, its equations, and the number of steps.
+
+    A step is halved until the next step is shorter (natural monotonicity test; Deuflhard, Newton Methods for Nonlinear
+    Problems, 2004, 3.3) or, in the first ``FAR_ROUNDS``, the sum of squares falls, with the weights before it. Near the
+    minimum that sum is flat, and as the weights change, steps by it can go to and fro.
+    """
+    prior = _prior(model, state, limits)
+    solved = solve(equations, noise, *prior)
+    for rounds in range(1, MAX_GAUSS_NEWTON_ITERATIONS + 1):
+        uncertainty = _uncertainty(solved, small)
+        for halving in range(MAX_STEP_HALVINGS):
+            moved, taken = stepped(model, state, solved.step * 0.5**halving)
+            further, last = model.equations(moved), bool(np.all(np.abs(taken) <= small * uncertainty))
+            after = _prior(model, moved, limits)
+            then = solve(further, noise, *after)
+            both = np.stack([equations.residual, further.residual * further.error / equations.error], axis=1)
+            squares = np.sum(equations.whitened(noise, both)[0] ** 2, axis=0)
+            squares += solved.scale * np.array([weight @ values**2 for weight, values in (prior, after)])
+            shorter = np.max(np.abs(then.step) / _uncertainty(then, small)) < np.max(np.abs(solved.step) / uncertainty)
+            if last or shorter or (rounds <= FAR_ROUNDS and squares[1] < squares[0]):
+                break
+        state, equations, prior, solved = moved, further, after, then
+        if last or np.all(np.abs(solved.step) <= small * _uncertainty(solved, small)):
+            break
+    return state, equations, rounds
+
+
+def _uncertainty(solved: Solution, small: float) -> Values:
+    """Return the standard uncertainties, of which a share ``small`` is at least rounding."""
+    return np.maximum(np.sqrt(np.diag(solved.covariance)), SMALLEST_STEP / small)
 
 
 def _prior(model: Model, state: State, limits: Limits) -> tuple[Values, Values]:
@@ -195,23 +247,15 @@ def _prior(model: Model, state: State, limits: Limits) -> tuple[Values, Values]:
 
 
 def refined(
-    equations: Equations, hypotheses: Sequence[NoiseHypothesis], prior: tuple[Values, Values]
-) -> tuple[list[NoiseHypothesis], float]:
-    """Return the hypotheses with significant weight, and the largest log likelihood over the given ones.
+    equations: Equations, near: Sequence[NoiseHypothesis], prior: tuple[Values, Values]
+) -> list[NoiseHypothesis]:
+    """Return the hypotheses with significant weight; ``near``: those of a grid whose likelihood is not negligible.
 
     Many moves determine their scatter to about a tenth; a grid with factors of 3 or 4 would make the covariance wrong
     by up to such factors. So each scatter is moved to the maximum of the restricted likelihood by decreasing factors.
     If the standard deviation s of its logarithm is then less than half a step of the grid, its levels are ``exp(0, +-s,
     +-2 s)`` times the maximum; otherwise they are the levels of the grid with weight.
     """
-    scores = project_out(equations, hypotheses).scores()
-    if len(hypotheses) == 1:
-        return list(hypotheses), float(scores.max())
-    near = [
-        noise
-        for noise, score in zip(hypotheses, scores, strict=True)
-        if score > scores.max() - NEGLIGIBLE_LOG_LIKELIHOOD
-    ]
 
     def restricted(noise: NoiseHypothesis) -> float:
         return solve(equations, noise, *prior).restricted
@@ -236,7 +280,7 @@ def refined(
                 chosen = (level * np.exp(np.arange(-2.0, 3.0) / np.sqrt(bend))).tolist()
         levels.append(chosen)
     of_each_bias = {n.bias: n for n in near}.values()
-    return [n.at(level) for n in of_each_bias for level in product(*levels)], float(scores.max())
+    return [n.at(level) for n in of_each_bias for level in product(*levels)]
 
 
 def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, values: Values) -> Solution:
@@ -329,51 +373,3 @@ def with_limits(
                 return found
         kept[int(np.argmax(np.where(kept, 0.0, known_now / u)))] = True
     return every
-
-
-def fit_robustly(
-    model: GyroscopeModel, fit_model: Callable[[GyroscopeModel], FitByHand], recordings: Sequence[Recording]
-) -> tuple[GyroscopeModel, FitByHand, list[dict[str, Any]]]:
-    """Fit rests and moves, with weights of Student's t if a move is an outlier.
-
-    ``fit_model``: function that fits a model. Returns model and fit with the variance by the weights, and the outliers:
-    ``recording, time_s, error_deg, over_noise, weight``.
-    """
-    fitted, moves = fit_model(model), model.moves
-    if moves is None:
-        return model, fitted, []
-    t, error = _over_noise(model, fitted)
-    limit = np.sqrt(2.0 * np.log(len(t) / OUTLIER_FALSE_ALARM))
-    if not np.any(t > limit):
-        return model, fitted, []
-    weight = np.ones(len(t))
-    for _ in range(ROBUST_ROUNDS):
-        before, weight = weight, np.minimum(1.0, (FREEDOM + 2.0) / (FREEDOM + t**2))
-        if np.abs(weight - before).max() < SETTLED_WEIGHT_CHANGE:
-            break
-        variance = np.where(t > 0.0, (error / np.maximum(t, 1e-12)) ** 2, 0.0)
-        model = model.with_excess(variance * (1.0 / weight - 1.0))
-        fitted = fit_model(model)
-        t, error = _over_noise(model, fitted)
-    outlying = [
-        {
-            "recording": recordings[int(model.every.recording[moves.after[k]])].name,
-            "time_s": float(moves.time[k, 0]),
-            "error_deg": float(error[k]),
-            "over_noise": float(t[k]),
-            "weight": float(weight[k]),
-        }
-        for k in np.flatnonzero(t > limit)
-    ]
-    return model, fitted, outlying
-
-
-def _over_noise(model: GyroscopeModel, fitted: FitByHand) -> tuple[Values, Values]:
-    """Return t of each move, and its residual, deg."""
-    C = model.equations(fitted.state).covariance(fitted.noise)
-    error = fitted.error[model.of_moves].reshape(-1, 2)
-    r = fitted.residual[model.of_moves].reshape(-1, 2) * error
-    variance = np.diag(C)[model.of_moves].reshape(-1, 2) * error**2 - model.excess[:, None]
-    size = np.sqrt(np.sum(r**2 / variance, axis=1))
-    scale = float(np.median(size)) / np.sqrt(2.0 * np.log(2.0))
-    return size / max(scale, 1e-12), np.linalg.norm(r, axis=1)

@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 
 MIN_MOVES = 6  # two equations each, for the nine of the matrix
 RATE_ITERATIONS = 6  # of effects that depend on the rate
-SETTLED_DPS = 1e-7  # change of the rate that ends these rounds
+SETTLED_DPS = 1e-6  # change of the rate that ends these rounds: 1e-5 deg in 10 s, 2e-3 of the noise of a move
 MOVED = "accelerometer_moved"
 NORMAL_DEGREES_OF_FREEDOM = 1e6  # degrees of freedom beyond which Student's t is normal to 1e-6
 INTERVAL_DRAWS, INTERVAL_TAIL = 4000, 0.005  # as in the 99 % interval of other held-out errors: 20 draws are beyond it
@@ -255,27 +255,34 @@ class GyroscopeModel:
         motion, v, A = self._turned(state)
         predicted = np.einsum("kij,kj->ki", A[:, 0], self.before)
         E = tangents(self.after)
-        G = (E @ skew(predicted))[:, None] @ A
-        P = moves.weight[:, :, None, None] * G  # deg per deg/s of a sample
-        PM = P @ state.matrix
-        noise, doubt = PM * self.white, np.einsum("ksij,ksj->ksi", G @ state.matrix, moves.doubt)
+        G = (E @ skew(predicted)) @ A.transpose(0, 2, 1, 3).reshape(moves.count, 3, -1)  # (k, 2, 3 s)
+        P = (moves.weight[:, None, :, None] * G.reshape(moves.count, 2, -1, 3)).reshape(-1, 3)  # deg per deg/s
+        PM = (P @ state.matrix).reshape(moves.count, 2, -1)
+        noise = PM * np.tile(self.white, moves.weight.shape[1])
         D = np.zeros((moves.count, 2, len(self.every.time), 3))  # deg per g of each rest's force
         u = gravity.force / np.linalg.norm(gravity.force, axis=1, keepdims=True)
         across = np.degrees(np.eye(3) - u[:, :, None] * u[:, None, :]) / self.gravity
         D[k, :, moves.after] = E @ across[moves.after]
         D[k, :, moves.before] = -E @ A[:, 0] @ across[moves.before]
-        variance = np.einsum("ksij,kslj->kil", noise, noise) + np.einsum("ksi,ksj->kij", doubt, doubt)
+        variance = noise @ noise.transpose(0, 2, 1)
+        if moves.doubt.any():
+            GM = (G.reshape(-1, 3) @ state.matrix).reshape(moves.count, 2, -1, 3)
+            doubt = np.einsum("kisj,ksj->kis", GM, moves.doubt)
+            variance += doubt @ doubt.transpose(0, 2, 1)
         variance += np.einsum("kimd,klmd,m->kil", D, D, gravity.spread**2 + gravity.ends**2)
         variance += self.excess[:, None, None] * np.eye(2)
         W = np.asarray(np.linalg.solve(np.linalg.cholesky(variance), np.eye(2)), np.float64)
         error = np.sqrt(np.einsum("kii->ki", variance)).ravel()
-        base = np.concatenate([-PM.sum(axis=1), np.einsum("ksei,ksj->keij", P, v).reshape(moves.count, 2, 9)], axis=2)
+        turned = P.reshape(moves.count, 2, -1, 3).transpose(0, 1, 3, 2).reshape(moves.count, 6, -1) @ v
+        by_bias = -PM.reshape(moves.count, 2, -1, 3).sum(axis=2)
+        base = np.concatenate([by_bias, turned.reshape(moves.count, 2, 9)], axis=2)
         bias = np.zeros((3, moves.count, 2, moves.count))
-        bias[:, k, :, k] = (-W @ noise.sum(axis=1)).transpose(0, 2, 1)
+        bias[:, k, :, k] = (W @ (by_bias * self.white)).transpose(0, 2, 1)
+        rows = -W @ PM
 
         def columns(term: EffectColumns) -> Values:
-            Z = term.effect.columns(self.sensor, motion, state.K, term.values).reshape(*moves.weight.shape, 3, -1)
-            return np.asarray((W @ -np.einsum("ksej,ksjp->kep", PM, Z)).reshape(n, -1))
+            Z = term.effect.columns(self.sensor, motion, state.K, term.values)
+            return np.asarray((rows @ Z.reshape(moves.count, rows.shape[2], -1)).reshape(n, -1))
 
         apart = np.degrees(np.einsum("kej,kj->ke", E, self.after - predicted))
         WD = np.einsum("kij,kjmc->kimc", W, D).reshape(n, -1, 3)
@@ -314,22 +321,28 @@ class GyroscopeModel:
         moves, K = self.moves, state.K
         assert moves is not None  # noqa: S101
 
-        def integrated(v: Values) -> tuple[Values, Values, Motion]:
-            rate = v @ state.matrix.T
+        def motion_at(rate: Values, force: Values) -> Motion:
+            signals = moves.time.ravel(), force.reshape(-1, 3), rate.reshape(-1, 3), moves.temperature.ravel()
+            return motion_of(*signals, still=False)
+
+        def integrated(rate: Values) -> tuple[Values, Values]:
             A = to_the_end(rate, moves.time)
             end = np.einsum("kij,kj->ki", A[:, 0], self.before)
-            force = self.gravity * np.einsum("ksij,ki->ksj", A, end)
-            signals = moves.time.ravel(), force.reshape(-1, 3), rate.reshape(-1, 3), moves.temperature.ravel()
-            return rate, A, motion_of(*signals, still=False)
+            return A, self.gravity * (end[:, None, None, :] @ A)[:, :, 0]
 
         plain = v = moves.reading - state.bias
-        rate, A, motion = integrated(plain)
+        rate, force = v @ state.matrix.T, np.zeros_like(v)
+        turns_force = any("specific_force" in t.effect.fields(self.sensor, t.values) for t in state.terms)
         for _ in range(RATE_ITERATIONS if state.terms else 0):
-            v, before = plain - effect_readings(self.sensor, state.terms, motion, K).reshape(plain.shape), rate
-            rate, A, motion = integrated(v)
+            if turns_force:
+                _, force = integrated(rate)
+            added = effect_readings(self.sensor, state.terms, motion_at(rate, force), K)
+            v, before = plain - added.reshape(plain.shape), rate
+            rate = v @ state.matrix.T
             if np.abs(rate - before).max() < SETTLED_DPS:
                 break
-        return motion, v, A
+        A, force = integrated(rate)
+        return motion_at(rate, force), v, A
 
 
 def model_of(

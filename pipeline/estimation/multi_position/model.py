@@ -1,4 +1,4 @@
-"""The model of one sensor in rests and moves: its linearised equations, hypotheses about the noise, and likelihoods.
+"""The model of one sensor in rests and moves: its linearised equations and hypotheses about the noise.
 
     r = X d + e,    cov e = k C,    C = I + S + sum_j a_j^2 diag(g_j) + c^2 D + q^2 H R H^T
 
@@ -14,19 +14,7 @@ D   : (n, n) covariance by errors of the direction of gravity at each rest, as l
 H   : (n, 3 t) derivatives with respect to the bias of each axis in each of t stretches of time, over its white noise
 R   : (t, t) covariance of a Gauss-Markov bias of unit variance, averaged over each stretch
 q   : standard deviation of that bias over white noise
-k   : at least 1: scatter beyond the hypotheses of a grid
-
-The steadiness of a unit by hand is unknown: a, c, q and k are free in all comparisons. The likelihood of a model is
-
-    -2 log L = rss / k + n log k + log det C,    rss = min_d (r - X d)^T C^-1 (r - X d),    k = max(1, rss / n)
-
-maximised over the hypotheses of a grid. Twice the gain in log L by v parameters is corrected for a variance that only
-the residuals show (Bartlett 1938):
-
-    gain = (1 - h + (v - 2) / (2 n)) 2 (log L' - log L)
-
-where h is the mean leverage of the model with the effect, over the kinds of equations in which the effect shows.
-delta BIC is the gain minus ``v log n``; p follows from chi squared with v degrees of freedom.
+k   : at least 1: scatter beyond the hypotheses of a grid (``likelihood``)
 
 A parameter that the recordings do not determine has a separate equation, a pseudo-observation of the value of an ideal
 sensor with the standard uncertainty u by the sensor file's limit (``limits``). ``between`` is the standard
@@ -41,7 +29,7 @@ parameter.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from itertools import pairwise, product
+from itertools import product
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -61,8 +49,6 @@ if TYPE_CHECKING:
 
 Model: TypeAlias = "AccelerometerModel | GyroscopeModel"
 
-# share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
-MIN_NEW_NORM_SHARE = 1e-3
 # The grids below were chosen by the study of 500 recordings (tests/study/test_hand_held_study.py); ``fit.refined``
 # refines their steps where the data determine the scatter better.
 UNLIKELY = -4.0  # prior log weight of a setting, e^-4 of the likeliest
@@ -152,9 +138,9 @@ class Equations:
 
     def covariance(self, noise: NoiseHypothesis) -> Values:
         """Return C: (n, n) array."""
-        C = np.diag(self.variance(noise))
-        if self.common is not None:
-            C += self.common
+        n = len(self.residual)
+        C = np.zeros((n, n)) if self.common is None else self.common.copy()
+        C.flat[:: n + 1] += self.variance(noise)
         if self.direction is not None and noise.direction:
             C += noise.direction**2 * self.direction
         if noise.bias.ratio:
@@ -166,16 +152,26 @@ class Equations:
 
     def whitened(self, noise: NoiseHypothesis, values: Values) -> tuple[Values, float]:
         """Return ``L^-1`` times (n, p) values, where ``L L^T = C``, and log det C."""
-        if self.common is None and not noise.direction and not noise.bias.ratio:
-            variance = self.variance(noise)
-            return values / np.sqrt(variance)[:, None], float(np.sum(np.log(variance)))
-        C = self.covariance(noise)
-        L, failed = scipy.linalg.lapack.dpotrf(C, lower=1)
-        if failed:
-            L = cholesky(C)
+        L, log_determinant = self.factor(noise)
+        if L.ndim == 1:
+            return values / L[:, None], log_determinant
         solved, failed = scipy.linalg.lapack.dtrtrs(L, values, lower=1)
         assert failed == 0  # noqa: S101
-        return solved, 2.0 * float(np.sum(np.log(np.diag(L))))
+        return solved, log_determinant
+
+    def factor(self, noise: NoiseHypothesis) -> tuple[Values, float]:
+        """Return the lower triangular L, or its diagonal where C is diagonal, and log det C."""
+        if self.common is None and not noise.direction and not noise.bias.ratio:
+            variance = self.variance(noise)
+            return np.sqrt(variance), float(np.sum(np.log(variance)))
+        L, failed = scipy.linalg.lapack.dpotrf(self.covariance(noise).T, lower=1, clean=0, overwrite_a=1)
+        if failed:
+            L = cholesky(self.covariance(noise))
+        return L, 2.0 * float(np.sum(np.log(np.diag(L))))
+
+    def ceilings(self, hypotheses: Sequence[NoiseHypothesis]) -> Values:
+        """Return the largest log L that a model can have under each hypothesis, with no residual: (t,) array."""
+        return np.array([noise.prior - 0.5 * self.factor(noise)[1] for noise in hypotheses])
 
 
 @dataclass(frozen=True)
@@ -311,88 +307,3 @@ def prior_hypotheses(prior: WanderPrior, white: float, kinds: int) -> list[Noise
     ]
     steady_moves = [h for h in hypotheses if kinds > 1 and h.scatter[1] in {START_SCATTERS[0], START_SCATTERS[2]}]
     return hypotheses + [replace(h, direction=c) for h in steady_moves for c in START_SCATTERS[2:]]
-
-
-def log_likelihood(rss: Values, n: int, log_determinant: Values) -> Values:
-    """Return log L of sums of squares of n equations; ``log_determinant``: log det C minus twice the prior."""
-    k = np.maximum(1.0, rss / n)
-    return np.asarray(-0.5 * (rss / k + n * np.log(k) + log_determinant))
-
-
-@dataclass(frozen=True)
-class ProjectedCandidates:
-    """Whitened candidates and residual with the model's columns projected out, under each of t hypotheses."""
-
-    raw: list[Values]  # each (t, n, p); projected columns of each candidate
-    # each (t, p, p); ``raw @ orthonormal`` are orthonormal directions, padded with zeros to p columns
-    orthonormal: list[Values]
-    residual: Values  # (t, n)
-    basis: Values  # (t, n, b); orthonormal, of the model's columns
-    log_determinant: Values  # (t,); log det C, minus twice the prior
-
-    def of_model(self) -> tuple[float, int]:
-        """Return log L of the model, and the index of its best hypothesis."""
-        scores = self.scores()
-        return float(scores.max()), int(np.argmax(scores))
-
-    def scores(self, explained: Values | float = 0.0) -> Values:
-        """Return log L under each hypothesis, where ``explained`` is subtracted from the sum of squares: (t,) array."""
-        rss = np.sum(self.residual**2, axis=1) - explained
-        return log_likelihood(rss, self.residual.shape[1], self.log_determinant)
-
-    def with_candidate(self, j: int) -> tuple[float, int]:
-        """Return log L with candidate j, and the index of its best hypothesis."""
-        along = (self.residual[:, None, :] @ self.raw[j]) @ self.orthonormal[j]
-        scores = self.scores(np.sum(along**2, axis=(1, 2)))
-        return float(scores.max()), int(np.argmax(scores))
-
-    def count(self, j: int, at: int) -> int:
-        """Return the number of directions of candidate j under a hypothesis."""
-        return int(np.any(self.orthonormal[j][at], axis=0).sum())
-
-    def shown(self, j: int, at: int) -> Values:
-        """Return the orthonormal directions of candidate j under a hypothesis: (n, p) array."""
-        return np.asarray(self.raw[j][at] @ self.orthonormal[j][at])
-
-    def correction(self, j: int, at: int, added: int, kinds: Values) -> float:
-        """Return the factor on the gain by candidate j; 0 if fewer than two equations remain to judge it.
-
-        ``j``, ``at``: candidate and hypothesis. ``added``: parameters, also those whose column is zero at their start.
-        ``kinds``: (s, n), positive where an equation is of a kind.
-        """
-        power = np.sum(self.shown(j, at) ** 2, axis=1)
-        leverage = np.sum(self.basis[at] ** 2, axis=1) + power
-        factor = 0.0
-        for kind in kinds > 0:
-            factor += float(power[kind].sum() / power.sum() * (1.0 - leverage[kind].mean())) if kind.any() else 0.0
-        n = len(leverage)
-        spare = factor * n - (added - float(power.sum()))
-        return max((spare + 0.5 * (added - 2)) / n, 0.0) if spare >= 2.0 - 1e-9 else 0.0
-
-
-def _orthonormalizers(columns: Values, sizes: Values) -> Values:
-    """Return the (t, p, p) factors that make (t, n, p) columns orthonormal.
-
-    Directions below ``MIN_NEW_NORM_SHARE`` are zeros.
-    """
-    size = np.where(sizes > 0.0, sizes, 1.0)
-    products = columns.transpose(0, 2, 1) @ columns / (size[:, :, None] * size[:, None, :])
-    values, vectors = np.linalg.eigh(products)
-    kept = values > MIN_NEW_NORM_SHARE**2
-    return vectors * (kept / np.sqrt(np.where(kept, values, 1.0)))[:, None, :] / size[:, :, None]
-
-
-def project_out(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -> ProjectedCandidates:
-    """Whiten the equations under every hypothesis and project the model's columns out of candidates and residual."""
-    model = equations.columns
-    together = np.concatenate([model, *equations.candidates, equations.residual[:, None]], axis=1)
-    edges = np.cumsum([model.shape[1], *(c.shape[1] for c in equations.candidates)])
-    whitened = [equations.whitened(noise, together) for noise in hypotheses]
-    white = np.array([w for w, _ in whitened])
-    sizes = np.linalg.norm(white, axis=1)
-    basis = white[:, :, : edges[0]] @ _orthonormalizers(white[:, :, : edges[0]], sizes[:, : edges[0]])
-    rest = white - basis @ (basis.transpose(0, 2, 1) @ white)
-    blocks = [slice(start, stop) for start, stop in pairwise(edges.tolist())]
-    factors = [_orthonormalizers(rest[:, :, block], sizes[:, block]) for block in blocks]
-    log_determinant = np.array([log - 2.0 * h.prior for (_, log), h in zip(whitened, hypotheses, strict=True)])
-    return ProjectedCandidates([rest[:, :, b] for b in blocks], factors, rest[:, :, -1], basis, log_determinant)

@@ -249,12 +249,17 @@ def to_the_end(rate: Values, time: Values) -> Values:
     """
     omega, dt = np.radians(rate), np.diff(time, axis=1)[:, :, None]
     phi = 0.5 * (omega[:, 1:] + omega[:, :-1]) * dt + np.cross(omega[:, :-1], omega[:, 1:]) * dt**2 / 12.0
-    back = turn_by_vector(-phi)
-    A = np.empty((*rate.shape[:2], 3, 3))
-    A[:, -1] = np.eye(3)
-    for k in range(rate.shape[1] - 2, -1, -1):
-        np.matmul(A[:, k + 1], back[:, k], out=A[:, k])
-    return A
+    k, n = phi.shape[:2]
+    size = int(np.ceil(np.sqrt(n + 1)))  # of a block: products within all blocks at once, then of the blocks
+    count = -(-(n + 1) // size)
+    back = np.tile(np.eye(3), (k, count * size, 1, 1))
+    back[:, :n] = turn_by_vector(-phi)
+    A = back.reshape(k, count, size, 3, 3)
+    for j in range(size - 2, -1, -1):
+        A[:, :, j] = A[:, :, j + 1] @ A[:, :, j]
+    for j in range(count - 2, -1, -1):
+        A[:, j] = A[:, j + 1, :1] @ A[:, j]
+    return A.reshape(k, -1, 3, 3)[:, : n + 1]
 
 
 def tangents(u: Values) -> Values:

@@ -12,7 +12,8 @@ noise is known and a scatter only adds to it: sigma is at least 1.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -24,15 +25,9 @@ from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.evidence import CandidateProblem, linear_problem
 from pipeline.estimation.gates import MIN_DELTA_BIC, passes
 from pipeline.estimation.gauss_markov import random_walks
-from pipeline.estimation.multi_position.fit import FitByHand, fit
-from pipeline.estimation.multi_position.model import (
-    MIN_NEW_NORM_SHARE,
-    Model,
-    NoiseHypothesis,
-    State,
-    project_out,
-    selection_hypotheses,
-)
+from pipeline.estimation.multi_position.fit import COMPARED_STEP, SMALL_LAST_STEP, FitByHand, fit
+from pipeline.estimation.multi_position.likelihood import CEILING_TO, MIN_NEW_NORM_SHARE, project_out
+from pipeline.estimation.multi_position.model import Model, NoiseHypothesis, State, selection_hypotheses
 from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import Score, without
 from pipeline.estimation.selection import MAX_SELECTED_EFFECTS
@@ -42,6 +37,7 @@ from pipeline.model.effects.base import Effect, Owner
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
+    from pipeline.estimation.multi_position.model import Equations
     from pipeline.estimation.rest_means import Rests
     from pipeline.records import Mask, Noise, SensorCalibration, Values
     from pipeline.settings import DataSheet
@@ -55,29 +51,34 @@ COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to
 
 @dataclass(frozen=True)
 class CandidateScores:
-    """The scores of all candidates, given a model."""
+    """The scores of all candidates, given a model; each by the candidate's name."""
 
-    scores: dict[str, Score]  # of those that the equations show
-    visible: dict[str, float]  # mean gain of each with its parameters at their limits; infinite without limits
-    shown: dict[str, Values]  # orthonormal directions of each under the model's best hypothesis
-    spare: dict[str, float]  # the factor on its gain; 0 where too few equations remain to judge it
-    signal: dict[str, Values]  # its fitted, whitened signal there
+    scores: dict[str, Score] = field(default_factory=dict)  # of those that the equations show
+    # mean gain with its parameters at their limits; infinite without limits
+    visible: dict[str, float] = field(default_factory=dict)
+    shown: dict[str, Values] = field(default_factory=dict)  # orthonormal directions under the model's best hypothesis
+    spare: dict[str, float] = field(default_factory=dict)  # factor on its gain; 0 with too few equations to judge it
+    signal: dict[str, Values] = field(default_factory=dict)  # its fitted, whitened signal there
+    # of the linear problem: values at its start, equations with its columns, log L under each hypothesis after a step
+    start: dict[str, tuple[EffectColumns, tuple[Equations, Values]]] = field(default_factory=dict)
+    fits: dict[str, FitByHand] = field(default_factory=dict)  # of those that were fitted to their optimum
 
 
-def fit_configured(
+def fit_configured(  # noqa: PLR0917  (what a fit starts from)
     model: Model,
     start: SensorCalibration,
     configured: Sequence[str],
     hypotheses: Sequence[NoiseHypothesis],
     limits: Mapping[str, Values] | None = None,
+    small: float = SMALL_LAST_STEP,
 ) -> FitByHand:
-    """Fit base and configured effects, from the best of their starts."""
+    """Fit base and configured effects, from the best of their starts; ``small``: see ``fit``."""
     fits = []
     for terms in starts_of(configured, model.sensor, start):
         state = State(
             start.bias, start.matrix, tuple(EffectColumns(t.effect, np.array(t.values, float)) for t in terms)
         )
-        fits.append(fit(model, state, hypotheses, limits or {}))
+        fits.append(fit(model, state, hypotheses, limits or {}, small=small))
     return max(fits, key=lambda fitted: fitted.log_likelihood)
 
 
@@ -85,27 +86,28 @@ class SelectionByHand:
     """The selected effects, and the scores of every candidate: ``first`` and ``last`` before and after the search.
 
     ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``data_sheet``: the
-    sensor's section of the configuration. ``names``: in order. ``steps``: score of each when it was accepted. ``fits``:
-    of base and configured effects, then with each further selected one. ``own``: for each selected effect, the scores
-    given all others.
+    sensor's section of the configuration. ``small``: see ``fit``. ``names``: in order. ``steps``: score of each when it
+    was accepted. ``fits``: of base and configured effects, then with each further selected one.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0917  (what a selection starts from)
         self,
         model: Model,
         start: SensorCalibration,
         configured: Sequence[str],
         noise: Noise | None,
         data_sheet: DataSheet,
+        small: float = SMALL_LAST_STEP,
     ) -> None:
-        self.model = model
+        self.model, self.small = model, small
         self.hypotheses = selection_hypotheses(noise, model.kinds)
         self.limits = limits_of(model.sensor, data_sheet)
         effects = catalogue().items()
         others = [e for n, e in effects if n not in configured and (not e.shown_by or e.shown_by in model.rests.kinds)]
         self.candidates = [e for e in others if not refusal(e, model.sensor, model.rests)]
         self.bounds = {n: MAX_TIMES_LIMIT * limit for n, limit in self.limits.items() if effect(n).nonlinear}
-        self.base = fit_configured(model, start, configured, self.hypotheses, self.bounds)
+        self.base = fit_configured(model, start, configured, self.hypotheses, self.bounds, small)
+        self.ceilings = self.base.equations.ceilings(self.hypotheses)
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
         self.fit = self.base
@@ -114,14 +116,18 @@ class SelectionByHand:
         for _ in range(MAX_SELECTION_ROUNDS):
             best = self._best(self.last) if len(self.names) < MAX_SELECTED_EFFECTS else None
             if best is not None:
-                self._add(best)
+                self._add(best, self.last)
                 self._drop()
             elif not self._exchange():
                 break
             self.last = self._scored(self.names)
-        parts = [self._fitted(self._state(self.names[:count])) for count in range(1, len(self.names))]
+        parts = [self._fitted(self.names[:count]) for count in range(1, len(self.names))]
         self.fits = [self.base, *parts, self.fit] if self.names else [self.base]
-        self.own = {name: self._without(name) for name in self.names}
+
+    @cached_property
+    def own(self) -> dict[str, CandidateScores]:
+        """For each selected effect, the scores given all others."""
+        return {name: self._without(name) for name in self.names}
 
     def _scored(self, names: Sequence[str]) -> CandidateScores:
         """Score every effect given base, configured and some of the selected effects."""
@@ -139,23 +145,30 @@ class SelectionByHand:
                 values = [np.where(_nonlinear(candidate, self.model.sensor), fitted[candidate.name], 0.0)]
             terms += [EffectColumns(candidate, v) for v in values]
         equations = self.model.equations(self._state(names), terms)
-        projected = project_out(equations, self.hypotheses)
+        fitted_model = self.fit if len(names) == len(self.names) else self.base
+        possible = np.flatnonzero(self.ceilings > fitted_model.log_likelihood - CEILING_TO)
+        projected = project_out(equations, [self.hypotheses[i] for i in possible])
         before, at = projected.of_model()
-        out = CandidateScores({}, {}, {}, {}, {})
+        out = CandidateScores()
         for j, term in enumerate(terms):
             name, count = term.effect.name, projected.count(j, at)
             if count == 0:
                 continue
             added = count + len(term.effect.nonlinear)
             factor = projected.correction(j, at, added, equations.scatter)
-            after, best = projected.with_candidate(j)
-            gain = factor * max(2.0 * (after - before), 0.0)
+            after = projected.with_candidate(j)
+            best = int(np.argmax(after))
+            gain = factor * max(2.0 * (float(after[best]) - before), 0.0)
             score = self._score(term, added, gain, projected.raw[j][best], projected.residual[best])
-            score = replace(score, setting=best, admissible=factor > 0.0)
+            score = replace(score, setting=int(possible[best]), admissible=factor > 0.0)
             if name in out.scores and out.scores[name].delta_bic >= score.delta_bic:
                 continue
             shown, raw, limit = projected.shown(j, at), projected.raw[j][at], self.limits[name]
             out.scores[name], out.spare[name], out.shown[name] = score, factor, shown
+            effects = [*equations.effects, equations.candidates[j]]
+            predicted = self.ceilings.copy()
+            predicted[possible] = after
+            out.start[name] = term, (replace(equations, effects=effects, candidates=[]), predicted)
             out.signal[name] = shown @ (shown.T @ projected.residual[at])
             seen = np.linalg.norm(raw, axis=0) > 0.0
             power = float(np.sum((limit[seen] * np.linalg.norm(raw[:, seen], axis=0)) ** 2))
@@ -188,7 +201,7 @@ class SelectionByHand:
             curved = bool(effect(score.name).nonlinear) or (self.model.kinds > 1 and top > MIN_DELTA_BIC)
             if not curved or score.delta_bic < max(COMPETES * top, 0.0):
                 continue
-            refit = self._fitted(self._state(names), EffectColumns(effect(score.name), score.values))
+            refit = self._with(names, score, scored)
             gain = max(2.0 * (refit.log_likelihood - before), 0.0) * scored.spare[score.name]
             scored.scores[score.name] = replace(
                 score,
@@ -203,10 +216,19 @@ class SelectionByHand:
         terms = (t for i, t in enumerate(self.fit.state.terms) if i < configured or t.effect.name in names)
         return replace(self.fit.state, terms=tuple(terms))
 
-    def _fitted(self, start: State, *further: EffectColumns) -> FitByHand:
-        """Fit from a state, with further effects."""
-        state = replace(start, terms=(*start.terms, *further))
-        return fit(self.model, state, self.hypotheses, self.bounds)
+    def _with(self, names: Sequence[str], score: Score, scored: CandidateScores) -> FitByHand:
+        """Fit a candidate together with some of the selected effects; ``scored``: the scores given these."""
+        if score.name not in scored.fits:
+            start, (term, known) = self._state(names), scored.start[score.name]
+            state = replace(start, terms=(*start.terms, term))
+            scored.fits[score.name] = fit(
+                self.model, state, self.hypotheses, self.bounds, known=known, small=COMPARED_STEP
+            )
+        return scored.fits[score.name]
+
+    def _fitted(self, names: Sequence[str]) -> FitByHand:
+        """Fit base, configured and some of the selected effects."""
+        return fit(self.model, self._state(names), self.hypotheses, self.bounds, small=self.small)
 
     def _best(self, scored: CandidateScores) -> Score | None:
         """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
@@ -227,15 +249,16 @@ class SelectionByHand:
         least = np.abs(score.values) - 2.0 * score.uncertainty
         return bool(np.all(least <= POSSIBLE * self.limits[score.name]))
 
-    def _add(self, score: Score) -> None:
+    def _add(self, score: Score, scored: CandidateScores) -> None:
+        near = self._with(self.names, score, scored)
+        known = near.equations, near.scores
+        self.fit = fit(self.model, near.state, self.hypotheses, self.bounds, known=known, small=self.small)
         self.names.append(score.name)
         self.steps[score.name] = score
-        self.fit = self._fitted(self.fit.state, EffectColumns(effect(score.name), score.values))
 
     def _remove(self, name: str) -> None:
         self.names.remove(name)
         del self.steps[name]
-        self.fit = self._fitted(replace(self.base.state, terms=self._state(self.names).terms))
 
     def _without(self, name: str) -> CandidateScores:
         return self._scored([n for n in self.names if n != name])
@@ -246,17 +269,23 @@ class SelectionByHand:
             score = self._without(name).scores.get(name)
             if score is None or score.delta_bic < 0.0:
                 self._remove(name)
+                self.fit = self._fitted(self.names)
 
     def _exchange(self) -> bool:
-        """Replace a selected effect by another one that explains significantly more."""
+        """Replace a selected effect by another one that explains significantly more.
+
+        Where it is the only one, the first scores are those of its rivals: both are given the base alone.
+        """
         for name in self.names:
-            scores, others = self._without(name).scores, [n for n in self.names if n != name]
+            others = [n for n in self.names if n != name]
+            scored = self._without(name) if others else self.first
+            scores = scored.scores
             threshold = MIN_DELTA_BIC + (scores[name].delta_bic if name in scores else float("-inf"))
             rivals = [s for s in scores.values() if s.name not in self.names and self._passes(s, others)]
             rival = max(rivals, key=lambda s: s.delta_bic, default=None)
             if rival is not None and rival.delta_bic > threshold:
                 self._remove(name)
-                self._add(rival)
+                self._add(rival, scored)
                 return True
         return False
 

@@ -7,7 +7,8 @@ import pytest
 from scipy.special import chdtrc, fdtrc
 
 from pipeline.estimation.gauss_markov import Setting
-from pipeline.estimation.multi_position.model import Equations, NoiseHypothesis, project_out
+from pipeline.estimation.multi_position.likelihood import project_out
+from pipeline.estimation.multi_position.model import Equations, NoiseHypothesis
 
 WHITE = [NoiseHypothesis(Setting(0.0, 1.0), (0.0,))]
 
@@ -29,7 +30,7 @@ def test_p_is_that_of_the_f_test_where_only_the_rests_tell_their_scatter(rests: 
         found = project_out(equations_of(r, base, candidate), WHITE)
         gain = (
             2.0
-            * (found.with_candidate(0)[0] - found.of_model()[0])
+            * (found.with_candidate(0).max() - found.of_model()[0])
             * found.correction(0, 0, added, np.ones((1, rests)))
         )
         before = r - base @ np.linalg.lstsq(base, r)[0]
