@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 MIN_NEW_NORM_SHARE = 1e-3
 NEGLIGIBLE_LOG_LIKELIHOOD = 12.0  # of log L below the best: a weight of 6e-6
-PREDICTED_TO = 4.0  # of log L by a linear model, more than in 60 simulated units by hand
-CEILING_TO = 1.0  # of log L without a residual: log det C hardly depends on the parameters
+PREDICTED_TO = 4.0  # of log L by a linear model: 9 of 10 fits of 13 simulated units differ by less than 0.5
+CEILING_TO = 1.0  # of log L without a residual, which changes by up to 0.02 between fits of these units
 
 
 def log_likelihood(rss: Values, n: int, log_determinant: Values) -> Values:
@@ -46,8 +46,8 @@ def log_likelihoods(
     """Return log L of the model under each hypothesis: (t,) array.
 
     ``predicted``: (t,), by a linear model. Then log L is computed only where it may be within
-    ``NEGLIGIBLE_LOG_LIKELIHOOD`` of the best if it exceeds its prediction by no more than those computed do, or
-    ``PREDICTED_TO``; the other values are the predicted ones.
+    ``NEGLIGIBLE_LOG_LIKELIHOOD`` of the best if it exceeds its prediction by no more than twice what those computed do,
+    or ``PREDICTED_TO``; the other values are the predicted ones.
     """
     if predicted is None:
         return _log_likelihoods(equations, hypotheses)
@@ -58,7 +58,7 @@ def log_likelihoods(
         if len(chosen) == 0:
             return scores
         found = _log_likelihoods(equations, [hypotheses[i] for i in chosen.tolist()])
-        excess = max(excess, float(np.max(found - scores[chosen])))
+        excess = max(excess, 2.0 * float(np.max(found - scores[chosen])))
         scores[chosen], still[chosen], best = found, False, max(best, float(found.max()))
 
 
