@@ -266,8 +266,7 @@ class GyroscopeModel:
         D[k, :, moves.before] = -E @ A[:, 0] @ across[moves.before]
         variance = noise @ noise.transpose(0, 2, 1)
         if moves.doubt.any():
-            GM = (G.reshape(-1, 3) @ state.matrix).reshape(moves.count, 2, -1, 3)
-            doubt = np.einsum("kisj,ksj->kis", GM, moves.doubt)
+            doubt = np.einsum("kisj,ksj->kis", G.reshape(moves.count, 2, -1, 3), moves.doubt @ state.matrix.T)
             variance += doubt @ doubt.transpose(0, 2, 1)
         variance += np.einsum("kimd,klmd,m->kil", D, D, gravity.spread**2 + gravity.ends**2)
         variance += self.excess[:, None, None] * np.eye(2)
