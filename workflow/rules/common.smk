@@ -25,7 +25,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import write_atomically
 from pipeline.estimation.stages import stage_module
 from pipeline.outcome import outcome
-from pipeline.pack import STAGES as PUBLISHED_STAGES
+from pipeline.pack import PACKED_STEPS as PUBLISHED_STAGES
 from pipeline.results_folder import finish_publishing, repetitions, replaced_folders
 from pipeline.run_progress import Monitor
 from pipeline.stages.batch import forget_last_outputs
