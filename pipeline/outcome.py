@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pipeline.errors import first
 from pipeline.files import INSTALLED, JSON, read_json, text_of_cell
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
-from pipeline.verdicts import FAILED, KINDS, READY, SETTING, WITH_THEM, Verdict, error_in_row, kinds_of, problems
+from pipeline.verdicts import FAILED, KINDS, READY, SETTING, WITH_THEM, Verdict, problems, state_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.verdicts import Problem
+    from pipeline.verdicts import Problem, RowState
 
     Ways = Sequence[Sequence[str]]
 
@@ -94,24 +94,25 @@ def read_summary(results: Path) -> list[dict[str, str]]:
         return [{text_of_cell(key): text_of_cell(value or "") for key, value in row.items()} for row in rows]
 
 
-def counts_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+def counts_of(rows: Sequence[Mapping[str, Any] | RowState]) -> dict[str, int]:
     """Return the number of units by their most urgent kind of problem, of those that are ready, and that failed."""
-    counts = Counter(next(iter(kinds_of(row)), READY) for row in rows)
+    counts = Counter(next(iter(state_of(row).kinds), READY) for row in rows)
     order = [READY, *(kind for kind in KINDS if kind not in (READY, FAILED)), FAILED]
     return {kind: counts[kind] for kind in order if counts[kind] or kind in (READY, FAILED)}
 
 
-def counted(rows: Sequence[Mapping[str, Any]]) -> str:
+def counted(rows: Sequence[Mapping[str, Any] | RowState]) -> str:
     """Return the counts in words: ``10 units: 4 ready, 1 effect missing, 0 failed``."""
     kinds = ", ".join(f"{count} {KINDS[kind].name}" for kind, count in counts_of(rows).items())
     return f"{len(rows)} unit{'s' * (len(rows) != 1)}: {kinds}"
 
 
-def all_well(rows: Sequence[Mapping[str, Any]]) -> str:
+def all_well(rows: Sequence[Mapping[str, Any] | RowState]) -> str:
     """Return the sentence for a campaign whose units are all ready; empty for another one."""
-    if not rows or any(map(kinds_of, rows)):
+    states = [*map(state_of, rows)]
+    if not states or any(state.kinds for state in states):
         return ""
-    ratios = [ratio for row in rows for s in SENSORS if (ratio := error_in_row(row, s).ratio)]
+    ratios = [error.ratio for state in states for error in state.errors.values() if error.ratio]
     error = f", and the error on held-out motion is at most {max(ratios):.3g} x noise" if ratios else ""
     who = f"All {len(rows)} units are" if len(rows) > 1 else "The unit is"
     return f"{who} ready: nothing that the recordings can show is missing{error}."

@@ -138,21 +138,42 @@ def error_of(held_out: Mapping[str, Any] | None) -> Error:
 
 def error_in_row(row: Mapping[str, Any], sensor: str) -> Error:
     """Return the same from a row of ``summary.csv``."""
-    vector = [_number(row.get(f"{sensor}_vector_{name}")) for name in ("error_before", "error_after", "noise_floor")]
-    if all(vector):
-        return Error("vector", *vector)
-    return Error(
-        "magnitude", *(_number(row.get(f"{sensor}_{name}")) for name in ("error_before", "error_after", "noise_floor"))
-    )
+    for kind, prefix in (("vector", f"{sensor}_vector"), ("magnitude", sensor)):
+        floor = _number(row.get(f"{prefix}_noise_floor"))
+        if floor or kind == "magnitude":
+            before, after = _number(row.get(f"{prefix}_error_before")), _number(row.get(f"{prefix}_error_after"))
+            break
+    return Error(kind, before, after, floor)
 
 
-def _number(value: object) -> float | None:
-    number = float(value) if isinstance(value, int | float | str) and value != "" else math.nan
-    return number if math.isfinite(number) else None
+class RowState(NamedTuple):
+    """A row of ``summary.csv`` with its errors by sensor, and what keeps the unit from being ready (``kinds_of``)."""
+
+    row: Mapping[str, Any]
+    errors: dict[str, Error]
+    kinds: dict[str, list[str]]
+
+
+def state_of(row: Mapping[str, Any] | RowState) -> RowState:
+    """Return the state of a row; a state as it is."""
+    if isinstance(row, RowState):
+        return row
+    errors = {sensor: error_in_row(row, sensor) for sensor in SENSORS}
+    return RowState(row, errors, _kinds(row, errors))
+
+
+def _number(value: Any) -> float | None:  # noqa: ANN401  (a cell: a number, a text of it, or nothing)
+    if isinstance(value, str):
+        value = float(value or "nan")
+    return float(value) if value is not None and -math.inf < value < math.inf else None
 
 
 def kinds_of(row: Mapping[str, Any]) -> dict[str, list[str]]:
     """Return what keeps a unit from being ready, the most urgent kind first, with the sensors concerned."""
+    return state_of(row).kinds
+
+
+def _kinds(row: Mapping[str, Any], errors: Mapping[str, Error]) -> dict[str, list[str]]:
     if row.get("status") != "ok":
         return {FAILED: []}
     causes = (row.get("incomplete") or "").split("; ")
@@ -160,7 +181,7 @@ def kinds_of(row: Mapping[str, Any]) -> dict[str, list[str]]:
     if str(row.get("pass")).lower() == "false":
         found[BEYOND_ACCEPTANCE] = []
     for sensor in SENSORS:
-        verdict, ratio = row.get(f"{sensor}_verdict") or Verdict.NOTHING_MISSING, error_in_row(row, sensor).ratio
+        verdict, ratio = row.get(f"{sensor}_verdict") or Verdict.NOTHING_MISSING, errors[sensor].ratio
         if any(cause.startswith(("diagnose: ", f"diagnose/{sensor}: ")) for cause in causes):
             verdict = Verdict.NOTHING_MISSING  # it is not known, and the kind is INCOMPLETE
         quiet = verdict in (Verdict.NOTHING_MISSING, Verdict.NOT_ENOUGH_DATA)
@@ -169,20 +190,19 @@ def kinds_of(row: Mapping[str, Any]) -> dict[str, list[str]]:
         kinds += [kind for kind in (IMPLAUSIBLE, NOT_HELD_OUT) if row.get(f"{sensor}_{kind}")]
         for kind in kinds:
             found.setdefault(kind, []).append(sensor)
-    order = [*KINDS]
-    return dict(sorted(found.items(), key=lambda entry: order.index(entry[0])))
+    return {kind: found[kind] for kind in KINDS if kind in found} if len(found) > 1 else found
 
 
-def problems(rows: Sequence[Mapping[str, Any]]) -> list[Problem]:
+def problems(rows: Sequence[Mapping[str, Any] | RowState]) -> list[Problem]:
     """Group the units of a campaign by what keeps them from being ready, the most urgent first."""
     groups: dict[tuple[str, tuple[str, ...]], list[tuple[float, str, str, list[str]]]] = {}
-    for row in rows:
-        for kind, sensors in kinds_of(row).items():
+    for row, errors, kinds in map(state_of, rows):
+        for kind, sensors in kinds.items():
             effects: tuple[str, ...] = ()
             if kind == Verdict.MISSING_EFFECT:
                 names = [(s, (row.get(f"{s}_selected") or "").split(";")) for s in sensors]
                 effects = tuple(f"{s}.{name}" for s, chosen in names for name in chosen if name)
-            ratio, worst = max(((error_in_row(row, s).ratio or 0.0, s) for s in sensors), default=(0.0, ""))
+            ratio, worst = max(((errors[s].ratio or 0.0, s) for s in sensors), default=(0.0, ""))
             step = row.get(f"{worst}_next_step") or ""
             groups.setdefault((kind, effects), []).append((ratio, str(row["unit"]), step, sensors))
     order, found = [*KINDS], []

@@ -20,12 +20,13 @@ from pipeline.report.fleet import parameter_table, wide
 from pipeline.report.numbers import Scale, number, percent, plain, scale_of, unit_text
 from pipeline.report.pages import script_data, template
 from pipeline.report.parameters import SUMMARY_COLUMNS
-from pipeline.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, error_in_row, kinds_of, problems
+from pipeline.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, problems, state_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from pipeline.files import JSON
+    from pipeline.verdicts import RowState
 
 
 UnitChart = tuple[Figure, dict[str, list[str]]]  # a chart of units, and the text of each dot by its colour
@@ -63,7 +64,8 @@ def render(
     commands; ``published``: units with a page where pages are published on request only, None: all; ``about``: the
     number of the last run that changed something, its day, and the version of this package.
     """
-    settings, found = settings or {"campaign": campaign}, problems(rows)
+    settings, states = settings or {"campaign": campaign}, [*map(state_of, rows)]
+    found = problems(states)
     devices = {row.get("serial") or row["unit"] for row in rows}
     frame = pd.DataFrame(rows).reindex(
         columns=list(dict.fromkeys([*SUMMARY_COLUMNS, *(k for row in rows for k in row)]))
@@ -71,7 +73,7 @@ def render(
     judged = [row.get("pass") for row in rows]
     serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
     fleet = [unit_chart for sensor in SENSORS if (unit_chart := _fleet_figure(sensor, frame))]
-    overview = [unit_chart for sensor in SENSORS if (unit_chart := overview_chart(sensor, rows))]
+    overview = [unit_chart for sensor in SENSORS if (unit_chart := overview_chart(sensor, states))]
     fitted = parameter_table({}) if parameters is None else parameters
     plots = strips(rows, fitted)
     causes: dict[str, list[str]] = {}
@@ -100,13 +102,14 @@ def render(
         statistics=statistics if statistics and len(rows) >= FEWEST_UNITS else None,
         strips=[figure for figure, _ in plots],
         far_shown=FAR_SHOWN,
+        states={state.row["unit"]: state for state in states},
         far=MARK_ABOVE_FLOORS,
         causes=sorted(causes.items(), key=lambda cause: -len(cause[1])),
         about=about or {},
         devices=len(devices),
-        counts=counts_of(rows),
+        counts=counts_of(states),
         kinds=KINDS,
-        well=all_well(rows).replace(" x noise", " × noise"),
+        well=all_well(states).replace(" x noise", " × noise"),
         problems=[(p, ratio_words(p).replace(" x ", " × "), command_of(p, settings)) for p in found],
         most_problems=MOST_PROBLEMS,
         all_command=explain_command(settings, ["--all"]),
@@ -120,45 +123,46 @@ def render(
         sections=comparisons,
         verdicts={verdict: verdict.css_class for verdict in Verdict},
         sensors=[s for s in SENSORS if frame[f"{s}_error_after"].notna().any()] or SENSORS,
-        scales={s: _scale(s, rows) for s in SENSORS},
+        scales={s: _scale(s, states) for s in SENSORS},
         kept=sorted(set(frame) - set(SUMMARY_COLUMNS)),
         page=page,
     )
     return text
 
 
-def overview_chart(sensor: str, rows: Sequence[JSON]) -> UnitChart | None:
+def overview_chart(sensor: str, rows: Sequence[JSON | RowState]) -> UnitChart | None:
     """Draw the error over the noise floor of each unit, and return the text of each dot by its colour.
 
     Up to ``NAMED_ROWS`` units: a row with the name of the unit, its ratio before and after, the worst first; of more
     units, a histogram of the ratio after calibration. None where no ratio is known.
     """
-    errors = [error_in_row(row, sensor) for row in rows]
+    states = [*map(state_of, rows)]
+    errors, names_of = [state.errors[sensor] for state in states], [str(state.row["unit"]) for state in states]
     known = sorted((i for i, e in enumerate(errors) if e.ratio), key=lambda i: -(errors[i].ratio or 0.0))
     if not known:
         return None
     ratio = np.array([errors[i].ratio for i in known], float)
-    ready = np.array([not any(sensor in of for of in kinds_of(rows[i]).values()) for i in known])
-    worst, far = rows[known[0]]["unit"], int(np.count_nonzero(ratio > MARK_ABOVE_FLOORS))
+    ready = np.array([not any(sensor in of for of in states[i].kinds.values()) for i in known])
+    worst, far = names_of[known[0]], int(np.count_nonzero(ratio > MARK_ABOVE_FLOORS))
     middle = f", median {number(float(np.median(ratio)))} ×" if len(known) > 1 else ""
     finding = f"{sensor.capitalize()}: {far} of {len(known)} units above {MARK_ABOVE_FLOORS:g} × noise"
     finding += f"; {number(float(ratio[0]))} × in {worst}" if far else f"; at most {number(float(ratio[0]))} ×"
     kind = "vector" if all(errors[i].kind == "vector" for i in known) else "magnitude"
     caption = f"Error of the {kind} on held-out motion, over the error that noise alone gives; lines: 1 × and 3 ×."
     description, label = f"{finding}{middle}.", "error over noise floor (logarithmic)"
-    states = ((ready, 2, "ready"), (~ready, 0, "not ready"))
+    groups = ((ready, 2, "ready"), (~ready, 0, "not ready"))
     if len(known) > NAMED_ROWS:
         edges = np.linspace(np.log10(min(ratio.min(), 1.0)), np.log10(max(ratio.max(), 3.0)) + 1e-9, HISTOGRAM_BINS + 1)
-        counts = np.array([np.histogram(np.log10(ratio[of]), edges)[0] for of, *_ in states], float)
+        counts = np.array([np.histogram(np.log10(ratio[of]), edges)[0] for of, *_ in groups], float)
         tops = np.cumsum(counts, axis=0)
         layers: list[ChartLayer] = []
-        for low, high, (of, colour, _) in zip([np.zeros(HISTOGRAM_BINS), tops[0]], tops, states, strict=True):
+        for low, high, (of, colour, _) in zip([np.zeros(HISTOGRAM_BINS), tops[0]], tops, groups, strict=True):
             if of.any():
                 layers.append(Area(np.repeat(low, 2), np.repeat(high, 2), colour, 10.0 ** np.repeat(edges, 2)[1:-1]))
         top = 1.1 * float(tops[-1].max())
         layers += [LineMark(np.full(2, x), np.array([0.0, top]), 3, "dashed") for x in (1.0, MARK_ABOVE_FLOORS)]
         layers.append(LineMark(10.0 ** ((edges[1:] + edges[:-1]) / 2), tops[-1], 5, "model"))
-        legend = (*((f"c{colour}", text) for of, colour, text in states if of.any()), ("c5", "units of a bin"))
+        legend = (*((f"c{colour}", text) for of, colour, text in groups if of.any()), ("c5", "units of a bin"))
         figure = Figure(f"ratio-{sensor}", finding, caption, legend)
         return chart(figure, description, [Panel(layers, "units", 150, limits=(0.0, top))], label, kind="log"), {}
     y = len(known) - np.arange(len(known), dtype=float)  # the first row on top
@@ -167,13 +171,13 @@ def overview_chart(sensor: str, rows: Sequence[JSON]) -> UnitChart | None:
     layers = [LineMark(np.full(2, x), np.array([0.4, y[0] + 1.4]), 5, "dashed") for x in (1.0, MARK_ABOVE_FLOORS)]
     layers.append(LineMark(np.stack([before, ratio, gap], 1).ravel(), np.repeat(y, 3), 3, "model"))
     numbers, values, legend_ = np.array(known) + 1, {}, []
-    for v, of, colour, text in ((before, np.isfinite(before), 3, "before"), *((ratio, *state) for state in states)):
+    for v, of, colour, text in ((before, np.isfinite(before), 3, "before"), *((ratio, *group) for group in groups)):
         if of.any():
             layers.append(Dots(v[of], y[of], colour, units=tuple(numbers[of].tolist())))
             legend_.append((f"c{colour}", text if colour == 3 else f"after, {text}"))
             values[f"c{colour}"] = [f"{text}: {number(x)} × noise" for x in v[of].tolist()]
     names = [(x, y[0] + 0.7, f"{x:g} ×") for x in (1.0, MARK_ABOVE_FLOORS)]
-    short = [_shortened(rows[i]["unit"]) for i in reversed(known)]
+    short = [_shortened(names_of[i]) for i in reversed(known)]
     left = round(NAME_LETTER * max(map(len, short))) + 10
     panel = Panel(layers, "", ROW * (len(known) + 1), limits=(0.4, y[0] + 1.4), rows=short, names=names)
     figure = Figure(f"ratio-{sensor}", finding, caption, tuple(legend_))
@@ -184,9 +188,9 @@ def _shortened(name: str) -> str:
     return name if len(name) <= LETTERS else f"{name[: LETTERS - 8]}…{name[-7:]}"
 
 
-def _scale(sensor: str, rows: Sequence[JSON]) -> Scale:
+def _scale(sensor: str, states: Sequence[RowState]) -> Scale:
     """Return the SI prefix for the errors of a sensor, by their median after calibration."""
-    errors = [after for row in rows if (after := error_in_row(row, sensor).after) is not None]
+    errors = [after for state in states if (after := state.errors[sensor].after) is not None]
     return scale_of(SENSOR_UNITS[sensor], float(np.median(errors)) if errors else None)
 
 

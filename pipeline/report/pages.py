@@ -16,7 +16,7 @@ from markupsafe import Markup
 from pipeline.estimation.candidates import is_fixed
 from pipeline.report import numbers
 from pipeline.report.numbers import Scale, measured, number, plain, unit_text
-from pipeline.verdicts import Verdict, error_in_row, kinds_of
+from pipeline.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping
@@ -56,7 +56,6 @@ def _environment() -> Environment:
     environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text}
     environment.filters |= {"parameter_texts": parameter_texts, "details": stage_details, "monte_carlo": monte_carlo_of}
     environment.filters |= {"script_data": script_data, "numeric": "#{}".format}
-    environment.filters |= {"error": error_in_row, "kinds": kinds_of}
     environment.globals |= {"asset": asset, "unit_link": unit_link, "Verdict": Verdict}
     return environment
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+from pipeline import diagnosis as diagnosis_package
+from pipeline import report as report_package
 from pipeline.commands.explain import explain
 from pipeline.diagnosis.words import in_words
 from pipeline.files import write_json
@@ -165,3 +167,10 @@ def test_values_on_a_logarithmic_axis_are_dots() -> None:
     drawn = [bars(Figure("n", "f"), [Point("a", 30.0)], "error", kind=kind).svg for kind in ("log", "symlog")]
     assert ["mean-dot" in svg for svg in drawn] == [True, False]
     assert ['class="bar' in svg for svg in drawn] == [False, True]
+
+
+def test_no_sentence_of_a_page_is_written_in_markdown() -> None:
+    folders = [Path(module.__file__ or "").parent / "templates" for module in (diagnosis_package, report_package)]
+    texts = [file.read_text(encoding="utf-8") for folder in folders for file in folder.glob("*.txt")]
+    assert len(texts) >= 4
+    assert not [mark for text in texts for mark in re.findall(r"`[^`]+`|\*\*[^*]+\*\*|\]\(", text)]
