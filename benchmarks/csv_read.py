@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import yaml
 from pyarrow import csv
 
 NAMES = (
@@ -52,20 +51,24 @@ def write_log(path: Path, rows: int) -> None:
 
 
 def read_ours(path: Path) -> tuple[int, list[float]]:
-    from imu_logs.profile import csv_formats  # noqa: PLC0415
-    from imu_logs.text_read import read_csv  # noqa: PLC0415  (a process loads its own reader only)
+    import imu_logs  # noqa: PLC0415  (a process loads its own reader only)
 
-    table = read_csv([path], csv_formats(yaml.safe_load(PROFILE.read_text())))
-    return len(table.time_ns), [float(table.time_ns[-1]) / 1e9, *(float(v[-1]) for v in table.values.values())]
+    log = imu_logs.read(path, PROFILE)
+    return len(log.time_ns), [float(log.time_ns[-1]) / 1e9, *(float(v[-1]) for v in log.values.values())]
 
 
 def read_marked(path: Path) -> tuple[int, list[float]]:
-    from imu_logs.profile import Checks  # noqa: PLC0415
+    from imu_logs.profile import Checks, load_profile  # noqa: PLC0415
     from pipeline.io.read import read_table, to_recording  # noqa: PLC0415
+    from pipeline.settings import Ingest, RecordingFile  # noqa: PLC0415
+    from pipeline.simulation.description import shipped_settings  # noqa: PLC0415
 
-    ingest = yaml.safe_load(PROFILE.read_text())
-    sensor = {"accelerometer": {"full_scale": 16.0}, "gyroscope": {"full_scale": 2000.0}}
-    recording = to_recording("log", {"role": "rests"}, read_table([path], ingest), sensor, Checks())
+    generic = shipped_settings(sensor="generic").sensor
+    scales = {"accelerometer": 16.0, "gyroscope": 2000.0}
+    sensor = generic.replaced(**{s: generic.of(s).replaced(full_scale=scale) for s, scale in scales.items()})
+    entry = RecordingFile(file="log", role="rests", axis=None, optional=False)
+    ingest = Ingest.model_validate(load_profile(PROFILE).model_dump())
+    recording = to_recording("log", entry, read_table([path], ingest), sensor, Checks())
     assert recording.accelerometer is not None  # noqa: S101
     return recording.samples, []
 
@@ -99,7 +102,8 @@ def measure(reader: str, path: Path) -> dict[str, float]:
 def read_once(reader: str, path: Path) -> None:
     if reader != "bare":
         importlib.import_module("pipeline.io.read")
-        importlib.import_module("imu_logs.text_read")
+        for module in ("imu_logs.text_read", "imu_logs.yaml_file"):
+            importlib.import_module(module)
     start = time.process_time()
     count, last = READERS[reader](path)
     cpu = time.process_time() - start

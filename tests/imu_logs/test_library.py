@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,9 +13,6 @@ import pytest
 
 import imu_logs
 from imu_logs.units import CANONICAL, CHANNELS
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 ROWS = 200
 
@@ -95,3 +92,9 @@ def test_a_proposal_reads_the_log_where_names_state_the_units(tmp_path: Path) ->
 def test_a_log_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     with pytest.raises(imu_logs.IngestError, match="No such file"):
         imu_logs.read(tmp_path / "none.csv")
+
+
+def test_the_library_stays_small() -> None:
+    modules = {f.name: len(f.read_text().splitlines()) for f in Path(imu_logs.__file__).parent.glob("*.py")}
+    assert len(modules) <= 21  # 20, and __init__.py
+    assert [name for name, lines in modules.items() if lines > 600] == []
