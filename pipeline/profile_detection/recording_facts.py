@@ -19,7 +19,7 @@ from imu_logs.message_read import LONGEST_ARRAY
 from imu_logs.units import DEGREES, TRIADS
 from pipeline.errors import IngestError
 from pipeline.io.gravity_rotation import FAILS_DEG, FITS_DEG, misfit_deg, moves_of, rests_of
-from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
+from pipeline.io.quality_flags import CLIPPED, GAP, REST_LIMITS, STUCK, equal_share
 from pipeline.preprocessing.bench import other_axes
 from pipeline.profile_detection.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS
@@ -128,7 +128,10 @@ def _sensor(name: str, readings: Values, rests: Sequence[tuple[int, int]]) -> st
         between = f" ({_number(size.min())} to {_number(size.max())})" if len(rests) > 1 else ""
         text += f"; at rest |a| = {_number(float(np.median(size)))} {unit}{between}"
     else:
-        text += f"; at rest {', '.join(_number(v) for v in np.median(means, axis=0))}"
+        usual = np.median(means, axis=0)
+        text += f"; at rest {', '.join(_number(v) for v in usual)}"
+        if np.abs(usual).max() > REST_LIMITS[name]:
+            text += f", more than the {REST_LIMITS[name]:g} {unit} of consumer sensors: check the unit"
     return f"{text}, noise {_number(float(np.median(noise)), 2)} a sample"
 
 

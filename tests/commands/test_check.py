@@ -546,3 +546,11 @@ def test_rests_that_a_run_does_not_use_are_counted() -> None:
     readings = up + 1e-3 * rng.standard_normal(up.shape), 0.05 * rng.standard_normal(up.shape)
     rests = dict(facts(Recording("recording", "rests", None, time_ns, *readings)))["rests"]
     assert "of them are shorter than 1 s, and a run does not use them" in rests
+
+
+def test_rates_at_rest_that_no_sensor_reads_are_doubted() -> None:
+    rng = np.random.default_rng(1)
+    force = np.tile([0.0, 0.0, 1.0], (2000, 1)) + 1e-3 * rng.standard_normal((2000, 3))
+    rate = np.array([166.0, -938.0, -444.0]) + 50.0 * rng.standard_normal((2000, 3))  # mdps, read as deg/s
+    lines = dict(facts(Recording("log", "rests", None, np.arange(2000) * 10_000_000, force, rate)))
+    assert "more than the 20 deg/s of consumer sensors: check the unit" in lines["gyroscope"]
