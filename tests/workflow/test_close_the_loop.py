@@ -99,7 +99,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Loop:
     run = f"snakemake --cores 2 --snakefile '{ROOT / 'Snakefile'}' --config 'campaign=my demo'"
     made.note("first", made.bash(run))
     made.said["again"] = made.bash(run)
-    made.said["explain"] = made.bash("python -m pipeline explain 'my demo'")
+    made.said["explain"] = made.bash(f"python -m pipeline explain 'my demo' {HIDDEN}")
     made.said["page"] = shown_on_the_page(made.results / "reports" / f"{HIDDEN}.html")[0]
     made.note("added", made.bash(made.said["page"]))
     made.said["diagnose"] = next(made.results.glob("logs/*/diagnose.log")).read_text()
@@ -112,15 +112,12 @@ def test_the_run_its_repetition_explain_and_the_page_show_the_same_command(loop:
     command = f"python -m pipeline add 'my demo' {HIDDEN} gyroscope.g_sensitivity"
     assert loop.said["page"] == command
     for when in ("first", "again"):
-        assert loop.said[when].rstrip().splitlines()[-5:] == [
-            "units calibrated: 2; look at results/my demo/index.html",
-            f"gyroscope, g_sensitivity missing: {HIDDEN}",
-            f"accelerometer, U does not include local gravity, up to 0.44 % of the matrix: {OTHER}, {HIDDEN}",
-            f"to add what is missing: {command}",
-            "for the evidence: python -m pipeline explain 'my demo'",
-        ]
+        *_, counts, missing, last = loop.said[when].rstrip().splitlines()
+        assert counts == "2 units: 1 ready, 1 effect missing, 0 failed; look at results/my demo/index.html"
+        assert re.fullmatch(rf"effect missing: {HIDDEN}; gyroscope: g sensitivity; [\d.]+ x noise", missing)
+        assert last == f"  {command}"
     lines = [line.strip() for line in loop.said["explain"].splitlines()]
-    assert lines[0] == "4 sensors of 2 units: 3 nothing missing, 1 missing effect"
+    assert lines[:2] == [HIDDEN, "gyroscope"]
     assert lines[lines.index("To add it:") + 1] == command
     assert any(line.startswith("U of the accelerometer does not include local gravity") for line in lines)
 
@@ -135,7 +132,7 @@ def test_the_held_out_error_falls_to_its_floor_and_the_other_unit_stays(loop: Lo
     assert f"diagnose: {OTHER} unchanged, taken from the last run\n" in loop.said["diagnose"]
     assert f"diagnose: {HIDDEN} unchanged" not in loop.said["diagnose"]
     assert "missing:" not in loop.said["added"]
-    told = f"{HIDDEN}, gyroscope: + g_sensitivity; held-out error {before:.3g} -> {after:.3g} deg/s, "
+    told = f"{HIDDEN}, gyroscope: + g_sensitivity; held-out error of the magnitude {before:.3g} -> {after:.3g} deg/s, "
     assert told + f"{after / floor_after:.3g} times the noise floor\n" in loop.said["added"]
     assert re.search(r"largest expanded uncertainty \(95 %\): .*matrix [\d.]+ -> [\d.]+ %\n", loop.said["added"])
 
