@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.findings import DiagnosisInput, Findings, diagnosis_of
+from pipeline.diagnosis.possible import without_impossible
 from pipeline.diagnosis.verdict import (
     EXPLAINED,
     MAX_UNKNOWN_PROBABILITY,
@@ -93,9 +94,9 @@ def diagnose(
             doubts += _doubts_of_gravity(gravity, case)
         elif not leaning.keys() & {*configured, *found.selected}:
             doubts += _doubts_of_axes(leaning, calibration)
-        evidence = replace(evidence, doubts=doubts, moves=moves)
+        evidence = replace(evidence, doubts=doubts, moves=moves, scatter=_scatter(calibration))
         found = judged(found, evidence)
-        return found, full or may_be_unknown(found.verdict, evidence)
+        return without_impossible(found, case), full or may_be_unknown(found.verdict, evidence)
 
     try:
         findings = procedure.findings(case)
@@ -108,6 +109,14 @@ def diagnose(
     if findings.deeper and (full or diagnosis.verdict != Verdict.NOTHING_MISSING):
         diagnosis = replace(diagnosis, further=findings.deeper())
     return diagnosis
+
+
+def _scatter(calibration: SensorCalibration) -> float:
+    """Return the scatter of moves or directions that a fit by hand found, over the noise; 0 for other fits."""
+    found = [
+        stage.details.get(f"scatter_of_{kind}") for stage in calibration.stages for kind in ("moves", "directions")
+    ]
+    return max((float(value) for value in found if value), default=0.0)
 
 
 def held_out_of(validation: SensorValidation) -> HeldOutError | None:

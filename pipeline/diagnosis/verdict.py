@@ -35,6 +35,9 @@ LEFT_OVER = 1.05  # times the noise floor: four standard deviations of the rms o
 DISAGREES = 1e-4  # probability by chance; the smallest of 842 sensors of null families was 0.006
 MIN_RESIDUAL_OVER_NOISE = 0.6  # times the noise: a smaller residual contradicts the noise of the rests
 FAR_ABOVE_BY_HAND = 10.0  # times the noise: nobody sets down or holds a unit so badly
+# times the noise: a good hand scatters the directions of the published wearable by 5.1, scale factors that drift by
+# 1 to 3 % in a recording by 6.8 to 21
+MAX_SCATTER_BY_HAND = 6.0
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
 STATIC_AGAIN = "record static again: ten minutes or more at rest, on a base that does not shake"
 SAME_SESSION = "record static in the session of the other recordings, without switching the unit off in between"
@@ -70,6 +73,7 @@ class VerdictInput:
     left_over_noise: float | None = None  # the same with them
     published: HeldOutError | None = None  # of the unit's calibration
     moves: tuple[float, float] | None = None  # rms error of held-out moves and its largest expected value, deg
+    scatter: float = 0.0  # of moves or directions by hand that the fit found, over the noise
     free: HeldOutError | None = (
         None  # of a free fit of the same recordings; filtered ones against the filtered reference
     )
@@ -233,6 +237,7 @@ RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
     (Verdict.REFERENCE_IN_DOUBT, "contradiction", lambda e: e.above),
     (Verdict.UNEXPLAINED, "unexplained", lambda e: e.unexplained),
     (Verdict.UNEXPLAINED, "moves", lambda e: e.moves and e.moves[0] > e.moves[1] and not e.missing),
+    (Verdict.UNEXPLAINED, "scatter", lambda e: e.scatter > MAX_SCATTER_BY_HAND and not e.missing),
     (Verdict.MISSING_EFFECT, "beyond", lambda e: e.missing),
     (Verdict.REFERENCE_IN_DOUBT, "disagreement", lambda e: e.disagrees),
     (Verdict.FLOOR_IN_DOUBT, "below", lambda e: e.published and e.published.below),

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.design import EffectColumns, NormalPrior
+from pipeline.estimation.design import EffectColumns, NormalPrior, placed
 from pipeline.estimation.free_curves import MAX_BEND_SHARE_OF_ROOM, Bend
+from pipeline.estimation.gates import possible
 from pipeline.model.effects import catalogue, effect, stated_priors
 from pipeline.model.effects.base import parameter_limits
 from pipeline.model.effects.mounting import SETUP_EFFECTS
@@ -166,6 +167,24 @@ def limits_of(sensor: str, data_sheet: DataSheet) -> dict[str, Values]:
     stated = data_sheet.effects
     limits = {n: parameter_limits(this, sensor, stated) for n, this in catalogue().items() if sensor in this.sensors}
     return {name: values for name, values in limits.items() if len(values)}
+
+
+def offered(
+    names: Sequence[str], terms: Sequence[EffectColumns], covariance: Values, data_sheet: DataSheet, sensor: str
+) -> list[str]:
+    """Return the selected effects for ``auto``: none if one of them is not possible (``gates.possible``).
+
+    ``terms``: of the fit, the last parameters of its ``covariance``.
+    """
+    limits, base = limits_of(sensor, data_sheet), len(covariance) - sum(len(term.values) for term in terms)
+    u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    found = placed(terms, base)
+    impossible = [
+        name
+        for name in names
+        if name in limits and not possible(found[name][0].values, u[found[name][1]], limits[name])
+    ]
+    return [] if impossible and not data_sheet.accept_implausible else list(names)
 
 
 def candidates_for(observations: Observations, configured: Sequence[str]) -> list[Effect]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.candidates import AUTO, MOUNTING, configured_effects
+from pipeline.estimation.candidates import AUTO, MOUNTING, configured_effects, offered
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
@@ -46,7 +46,9 @@ def fit(
         observations = observe(sensor, recordings.filtered, settings.table)
         if not observations.parts:
             return before
-        names += select(observations, names, noise, settings.sensor.of(sensor), accelerometer=accelerometer).names
+        data_sheet = settings.sensor.of(sensor)
+        chosen = select(observations, names, noise, data_sheet, accelerometer=accelerometer)
+        names += offered(chosen.names, chosen.fit.terms, chosen.fit.covariance, data_sheet, sensor)
     if not names:
         return before
     return fit_joint(sensor, recordings.filtered, names, noise, settings, before, accelerometer)

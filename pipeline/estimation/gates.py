@@ -24,12 +24,15 @@ from pipeline.model.effects import effect
 if TYPE_CHECKING:
     from pipeline.estimation.ranking import Score
     from pipeline.model.effects.base import Effect
+    from pipeline.records import Values
 
 MIN_DELTA_BIC = 10.0  # "very strong" evidence (Raftery, Sociological Methodology 25, 1995)
 MIN_DELTA_BIC_OF_SLOW = 16.0  # of a slow effect, see above
 MAX_MIN_DELTA_BIC = 30.0  # largest delta BIC that is required after effects with a large gain
 ERROR_OF_FIRST_ORDER = 2e-4  # of the gain in 2 log L of effects: the error of their equations of first order
 MAX_FALSE_PROBABILITY = 0.01  # of a false selection by chance, over all candidates
+NORMAL_FACTOR = 1.96  # of a standard uncertainty, 95 %
+TIMES_POSSIBLE = 3.0  # times the sensor file's limit: a parameter beyond, by its 95 % interval, is not possible
 MAX_FALSE_DEPENDENCE = 1e-3  # probability that a complete model seems to depend on a covariate, over all tests
 
 
@@ -55,3 +58,8 @@ def min_gain(this: Effect, sensor: str, parameters: int, equations: float, candi
     """
     by_chance = float(scipy.special.chdtri(parameters, MAX_FALSE_PROBABILITY / candidates))
     return max(parameters * float(np.log(equations)) + min_delta_bic(this, sensor), by_chance)
+
+
+def possible(values: Values, uncertainty: Values, limits: Values) -> bool:
+    """Return whether no parameter of an effect is beyond three times its limit, by its 95 % interval: (p,) arrays."""
+    return bool(np.all(np.abs(values) - NORMAL_FACTOR * uncertainty <= TIMES_POSSIBLE * limits))

@@ -167,6 +167,7 @@ class SensorDiagnosis:
     to_distinguish: str = ""
     not_observable: Mapping[str, str] = field(default_factory=dict)  # effect to the reason
     unexplained: Sequence[Dependence] = ()
+    candidates: Mapping[str, str] = field(default_factory=dict)  # effects that fit best but are not possible, and why
     suggested_effect: Mapping[str, Any] | None = None  # content of an effect file
     method_errors: Sequence[MethodError] = ()
     next_experiment: str = ""
@@ -199,6 +200,7 @@ class SensorDiagnosis:
             },
             "to_distinguish": self.to_distinguish,
             "not_observable": [{"effect": name, "reason": reason} for name, reason in self.not_observable.items()],
+            "candidates": [{"effect": name, "reason": reason} for name, reason in self.candidates.items()],
             "unexplained": [entry.to_json(searched=searched) for entry in self.unexplained],
             "suggested_effect": self.suggested_effect,
             "next_experiment": self.next_experiment,

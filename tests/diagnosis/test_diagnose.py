@@ -242,10 +242,16 @@ def test_tilt_of_the_table_never_changes_a_rate() -> None:
     assert "does not change a rate" in reason_of(diagnosed("gyroscope", hidden("gyroscope")), "table_tilt")
 
 
-def test_an_effect_outside_the_data_sheet_is_called_implausible() -> None:
-    recordings = record(Session(1, effects={"accelerometer": {"lever_arm": np.array([2.0, 0.0, 0.0])}}))
-    part = diagnosed("accelerometer", recordings)
-    assert part["selected"] == ["lever_arm"]
+@pytest.mark.parametrize(("factor", "offered"), [(2.0, True), (20.0, False)])
+def test_an_effect_outside_the_data_sheet_is_implausible_and_far_outside_no_cause(
+    factor: float, *, offered: bool
+) -> None:
+    arm = factor * SHEET.accelerometer.effects["lever_arm"]
+    part = diagnosed(
+        "accelerometer", record(Session(1, effects={"accelerometer": {"lever_arm": np.array([arm, 0.0, 0.0])}}))
+    )
+    assert part["selected"] == (["lever_arm"] if offered else [])
+    assert [c["effect"] for c in part["candidates"]] == ([] if offered else ["lever_arm"])
     assert not part["ranking"][0]["plausible"]
     assert any("sensor file" in line for line in in_words(part, "accelerometer"))
 
@@ -323,7 +329,8 @@ def test_units_do_not_change_what_is_selected() -> None:
         replace(r, accelerometer=None if r.accelerometer is None else 9.80665 * r.accelerometer) for r in recordings
     ]
     here = diagnose(SensorCalibration("accelerometer"), recordings, None, settings("accelerometer"))
-    there = diagnose(SensorCalibration("accelerometer"), scaled, None, settings("accelerometer"))
+    beyond = settings_of(settings("accelerometer"), **{"sensor.accelerometer.accept_implausible": True})
+    there = diagnose(SensorCalibration("accelerometer"), scaled, None, beyond)
     assert there["selected"] == here["selected"] == ["quadratic_nonlinearity", "table_tilt"] or there[
         "selected"
     ] == here["selected"] == ["table_tilt", "quadratic_nonlinearity"]

@@ -156,7 +156,8 @@ def test_a_recording_of_another_unit_is_unexplained_with_a_reason_and_nothing_is
     assert found["verdict"] == "unexplained"
     assert "sensor file" in found["reason"]
     assert (found["override"], commands_of(found, "accelerometer", "U1", {"campaign": "c"})) == ("", {})
-    assert any(not entry["plausible"] for entry in found["ranking"] if entry["effect"] in found["selected"])
+    named = {*found["selected"], *(entry["effect"] for entry in found["candidates"])}
+    assert any(not entry["plausible"] for entry in found["ranking"] if entry["effect"] in named)
     row = summary_row("U1", {}, None, {"accelerometer": found}, {})
     assert (row["accelerometer_verdict"], row["accelerometer_selected"]) == ("unexplained", None)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.candidates import AUTO, limits_of
+from pipeline.estimation.candidates import AUTO, limits_of, offered
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.fit import plausible, require_observable
 from pipeline.estimation.multi_position.model import selection_hypotheses
@@ -79,7 +79,10 @@ def fit_effects_by_rests(
     model = model_of(recordings.filtered, before, noise, settings, other)
     if model is None:
         return before
-    names = SelectionByHand(model, before, [], noise, data_sheet).names if wanted == AUTO else list(wanted)
+    names = [] if wanted == AUTO else list(wanted)
+    if wanted == AUTO:
+        chosen = SelectionByHand(model, before, [], noise, data_sheet)
+        names = offered(chosen.names, chosen.fit.state.terms, chosen.fit.covariance, data_sheet, sensor)
     if not names:
         return before
     for name in names:

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from unit_settings import settings_of
+
+from pipeline.diagnosis.findings import DiagnosisInput
+from pipeline.diagnosis.possible import without_impossible
+from pipeline.diagnosis.verdict import MAX_SCATTER_BY_HAND, VerdictInput, decide
+from pipeline.records import Candidate, Estimate, Noise, Recording, SensorCalibration, SensorDiagnosis
+from pipeline.verdicts import Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+SETTINGS = settings_of(sensor="mpu6050")
+WHITE = SETTINGS.sensor.gyroscope.noise_density * np.sqrt(0.5 / 0.02)
+
+
+def case_of(temperature: np.ndarray | None = None, white: float = WHITE, **settings: Any) -> DiagnosisInput:
+    time = 20_000_000 * np.arange(500)
+    warm = np.linspace(20.0, 30.0, 500).round(2) if temperature is None else temperature
+    recording = Recording("rests", "rests", None, time, np.ones((500, 3)), np.ones((500, 3)), warm)
+    noise = Noise(np.full(3, white), np.zeros(3), 100.0, "rests")
+    found = settings_of(SETTINGS, **settings)
+    return DiagnosisInput(SensorCalibration("gyroscope"), [recording], noise, found, None, [])
+
+
+def missing(name: str, values: Mapping[str, float], u: float) -> SensorDiagnosis:
+    estimates = {symbol: Estimate(value, "1", u) for symbol, value in values.items()}
+    entry = Candidate(name, 100.0, 1e-9, estimates, 0.9, None, None, {}, plausible=False)
+    return SensorDiagnosis(
+        Verdict.MISSING_EFFECT, [], selected=[name], ranking=[entry], override=f"effects.gyroscope=[{name}]"
+    )
+
+
+def bias_temperature(factor: float, u: float = 0.001) -> SensorDiagnosis:
+    limit = SETTINGS.sensor.gyroscope.effects["bias_temperature"]
+    return missing("bias_temperature", {f"b_T_{axis}": factor * limit for axis in "xyz"}, u)
+
+
+def assert_no_cause(found: SensorDiagnosis, name: str, words: str) -> None:
+    assert (found.verdict, list(found.selected), found.override) == (Verdict.UNEXPLAINED, [], "")
+    assert list(found.candidates) == [name]
+    assert words in found.candidates[name]
+    assert words in found.reason
+    assert found.to_json()["candidates"] == [{"effect": name, "reason": found.candidates[name]}]
+
+
+@pytest.mark.parametrize(("factor", "possible"), [(0.9, True), (2.9, True), (3.2, False)])
+def test_an_effect_beyond_three_times_its_limit_is_no_cause(factor: float, *, possible: bool) -> None:
+    before = bias_temperature(factor)
+    found = without_impossible(before, case_of())
+    if possible:
+        assert found is before
+    else:
+        assert_no_cause(found, "bias_temperature", "3.2 times the sensor file's limit")
+
+
+def test_an_interval_that_reaches_three_times_the_limit_is_possible() -> None:
+    before = bias_temperature(3.2, u=0.04)
+    assert without_impossible(before, case_of()) is before
+
+
+def test_a_sensor_that_is_accepted_as_implausible_may_exceed_its_limits() -> None:
+    before = bias_temperature(9.0)
+    assert without_impossible(before, case_of(**{"sensor.gyroscope.accept_implausible": True})) is before
+
+
+def test_a_temperature_that_does_not_change_contradicts_an_effect_of_temperature() -> None:
+    steady = np.full(500, 25.0)
+    assert_no_cause(
+        without_impossible(bias_temperature(0.5), case_of(steady)), "bias_temperature", "temperature changes"
+    )
+
+
+def test_no_unit_turns_faster_than_the_earth() -> None:
+    found = missing("earth_rotation", {"E_x": 0.006, "E_y": 0.0, "E_z": 0.0}, 1e-4)
+    assert_no_cause(without_impossible(found, case_of()), "earth_rotation", "more than the Earth turns")
+    slower = missing("earth_rotation", {"E_x": 0.003, "E_y": 0.0, "E_z": 0.0}, 1e-4)
+    assert without_impossible(slower, case_of()) is slower
+
+
+def test_noise_far_beyond_the_sensor_file_is_no_cause_but_another_sensor() -> None:
+    found = without_impossible(bias_temperature(0.5), case_of(white=10.0 * WHITE))
+    assert_no_cause(found, "bias_temperature", "not that of this sensor")
+
+
+def test_moves_that_scatter_far_beyond_the_noise_are_unexplained() -> None:
+    e = VerdictInput("gyroscope", Verdict.NOTHING_MISSING, on_table=False, scatter=1.1 * MAX_SCATTER_BY_HAND)
+    verdict, reason = decide(e)
+    assert verdict == Verdict.UNEXPLAINED
+    assert "6.6 times the noise" in reason
+    steady = VerdictInput("gyroscope", Verdict.NOTHING_MISSING, on_table=False, scatter=0.9 * MAX_SCATTER_BY_HAND)
+    assert decide(steady)[0] == Verdict.NOTHING_MISSING
