@@ -51,7 +51,10 @@ def with_open(
 def _open(
     sensor: str, calibration: SensorCalibration, hidden: Mapping[str, Mapping[str, str] | None], U: Values
 ) -> Iterator[tuple[str, Values, str]]:
-    """Yield name, largest change of bias and matrix, (12,), and reason of each open effect."""
+    """Yield name, largest change of bias and matrix, (12,), and reason of each open effect.
+
+    A change by a contained effect that the recordings show is not open.
+    """
     reasons: dict[str, str] = {}
     for name in calibration.at_limits:
         owner, _, plain = name.rpartition(".")
@@ -63,7 +66,12 @@ def _open(
     contained = {f"{name.rpartition('.')[0]}.{other}".lstrip(".") for name in reasons
                  for other in effect(name.rpartition(".")[2]).contains}  # fmt: skip
     for name, reason in reasons.items():
-        a = np.abs(calibration.at_limits[name]).sum(axis=1)
+        owner, _, plain = name.rpartition(".")
+        within = [f"{owner}.{other}".lstrip(".") for other in effect(plain).contains]
+        seen = [
+            _largest(calibration, other) for other in within if other in calibration.at_limits and other not in reasons
+        ]
+        a = np.clip(_largest(calibration, name) - np.max([*seen, np.zeros(len(U))], axis=0), 0.0, None)
         if name not in contained | fitted and np.any(a > NEGLIGIBLE * U):
             yield name, a, reason
     for entry in calibration.budget.not_included if calibration.budget else ():
@@ -74,6 +82,11 @@ def _open(
                 base_values(bias, entry.up_to.get("matrix", 0.0) * np.abs(calibration.matrix)),
                 entry.reason,
             )
+
+
+def _largest(calibration: SensorCalibration, name: str) -> Values:
+    """Return the largest change of bias and matrix by an effect, (12,)."""
+    return np.asarray(np.abs(calibration.at_limits[name]).sum(axis=1))
 
 
 def _shaped(values: Values) -> dict[str, Any]:

@@ -39,6 +39,13 @@ def test_an_open_effect_adds_a_rectangular_distribution() -> None:
     assert found["uncertainty_with_open"]["bias"] == pytest.approx([expected] * 3, rel=1e-6)
 
 
+def test_the_part_of_an_effect_that_the_recordings_show_is_not_open() -> None:
+    changes = {"bias_temperature": np.full((12, 1), 0.5), "bias_temperature_quadratic": np.full((12, 2), [0.5, 0.01])}
+    hidden = {"accelerometer": {"bias_temperature_quadratic": "below the noise"}, "gyroscope": {}}
+    found = with_open("accelerometer", replace(CALIBRATION, at_limits=changes), hidden)
+    assert found["open"][0]["up_to"]["bias"] == pytest.approx([0.01] * 3)
+
+
 def test_without_a_diagnosis_every_effect_is_open() -> None:
     found = with_open("accelerometer", CALIBRATION, {"accelerometer": None, "gyroscope": None})
     assert "scale_factor_asymmetry" in [entry["effect"] for entry in found["open"]]
