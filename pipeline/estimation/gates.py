@@ -20,6 +20,7 @@ import numpy as np
 import scipy
 
 from pipeline.model.effects import effect
+from pipeline.records import coverage_factor
 
 if TYPE_CHECKING:
     from pipeline.estimation.ranking import Score
@@ -31,7 +32,6 @@ MIN_DELTA_BIC_OF_SLOW = 16.0  # of a slow effect, see above
 MAX_MIN_DELTA_BIC = 30.0  # largest delta BIC that is required after effects with a large gain
 ERROR_OF_FIRST_ORDER = 2e-4  # of the gain in 2 log L of effects: the error of their equations of first order
 MAX_FALSE_PROBABILITY = 0.01  # of a false selection by chance, over all candidates
-NORMAL_FACTOR = 1.96  # of a standard uncertainty, 95 %
 TIMES_POSSIBLE = 3.0  # times the sensor file's limit: a parameter beyond, by its 95 % interval, is not possible
 MAX_FALSE_DEPENDENCE = 1e-3  # probability that a complete model seems to depend on a covariate, over all tests
 
@@ -62,4 +62,4 @@ def min_gain(this: Effect, sensor: str, parameters: int, equations: float, candi
 
 def possible(values: Values, uncertainty: Values, limits: Values) -> bool:
     """Return whether no parameter of an effect is beyond three times its limit, by its 95 % interval: (p,) arrays."""
-    return bool(np.all(np.abs(values) - NORMAL_FACTOR * uncertainty <= TIMES_POSSIBLE * limits))
+    return bool(np.all(np.abs(values) - float(coverage_factor(np.inf)) * uncertainty <= TIMES_POSSIBLE * limits))
