@@ -51,6 +51,10 @@ class Pack:
         archive = self._archive
         return cast("bytes", self._checked(lambda: archive.read(name), name))
 
+    def digest(self, name: str) -> str:
+        """Return a digest of the content of a member, which ``new_pack`` wrote as its comment."""
+        return self._archive.NameToInfo[name].comment.decode() or _digest(self.read(name))
+
     def json(self, name: str) -> Any:  # noqa: ANN401  (any JSON value)
         """Return the value of a JSON member."""
         content = self.read(name)
@@ -73,6 +77,10 @@ class Pack:
             raise DamagedFileError(f"{what}; {WRITE_AGAIN}", str(self.path)) from None
 
 
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:32]
+
+
 @contextmanager
 def new_pack(path: Path) -> Iterator[Callable[[Mapping[str, bytes]], None]]:
     """Write a pack; yields the function that adds files. The pack gets its name after the block, when it is flushed."""
@@ -83,7 +91,9 @@ def new_pack(path: Path) -> Iterator[Callable[[Mapping[str, bytes]], None]]:
         def add(files: Mapping[str, bytes]) -> None:
             for name, content in files.items():
                 method = zipfile.ZIP_STORED if name.endswith(".parquet") else zipfile.ZIP_DEFLATED
-                archive.writestr(zipfile.ZipInfo(name), content, method, COMPRESSION_LEVEL)
+                member = zipfile.ZipInfo(name)
+                member.comment = _digest(content).encode()
+                archive.writestr(member, content, method, COMPRESSION_LEVEL)
 
         yield add
         archive.close()

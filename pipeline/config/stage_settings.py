@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pipeline.config.user_effects import effects_for
 from pipeline.files import CONFIGS, canonical_json
 from pipeline.history import SENSORS, digest
-from pipeline.io.files import recording_files
+from pipeline.io.files import state_of_files
 from pipeline.settings import Board, Settings, Stated, Unit
 from pipeline.unit import STEPS
 
@@ -150,19 +150,11 @@ def _content(
     return content
 
 
-def _recordings(campaign: Campaign, rows: Sequence[UnitRow]) -> str | None:
-    """Return a digest of the names, sizes and times of the recordings; None if the run simulates them."""
+def _recordings(campaign: Campaign, rows: Sequence[UnitRow]) -> dict[str, str] | None:
+    """Return the state of the recordings of each unit; None if the run simulates them."""
     if campaign.simulation:
         return None
-    digest = hashlib.sha256()
-    for row in rows:
-        folder, sheet = campaign.folder(row.name), row.config.procedure.sheet
-        files = recording_files(row.config.procedure, row.config.ingest, folder)
-        sheets = [path for path in [folder / (sheet or "")] if path.is_file()]
-        for path in sorted({*sheets, *(path for paths in files.values() for path in paths)}):
-            status = path.stat()
-            digest.update(f"{path}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
-    return digest.hexdigest()[:16]
+    return {r.name: state_of_files(r.config.procedure, r.config.ingest, campaign.folder(r.name)) for r in rows}
 
 
 def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:

@@ -7,6 +7,7 @@ message logs, joined on time), they replace the ``.csv``.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from pathlib import Path
@@ -40,6 +41,17 @@ def recording_files(procedure: Procedure, ingest: Ingest, folder: Path) -> dict[
                 found[name] = files
                 break
     return found
+
+
+def state_of_files(procedure: Procedure, ingest: Ingest, folder: Path) -> str:
+    """Return a digest of the names, sizes and times of the files of a unit's recordings, and of their sheet."""
+    sheets = [path for path in [folder / (procedure.sheet or "")] if path.is_file()]
+    files = recording_files(procedure, ingest, folder).values()
+    digest = hashlib.sha256()
+    for path in sorted({*sheets, *(path for paths in files for path in paths)}):
+        status = path.stat()
+        digest.update(f"{path}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
+    return digest.hexdigest()[:16]
 
 
 def candidate_files(procedure: Procedure, ingest: Ingest) -> dict[str, list[list[str]]]:

@@ -16,11 +16,12 @@ import json
 import sys
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import DamagedFileError, failure_of, is_of_run, omission
+from pipeline.errors import DamagedFileError, PipelineError, failure_of, is_of_run, omission
 from pipeline.files import read_json, write_json
 from pipeline.pack import FAILED, INCOMPLETE, Files, Pack, as_bytes, new_pack
 from pipeline.results_folder import hold_as_job, record_written, repetitions
@@ -48,11 +49,11 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "prior": ("ingest", "filter", "calibration", "validate", "diagnose", "report", "lots"),
     "gather": (),
 }
-OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "last", "code"), "diagnose": ("code",)}
+OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "last")}
 AFTER_FIT = ("diagnose", "export", "report", "summary", "prior")  # a calibration does not depend on them
 INPUTS_OF = ".inputs"  # member of a pack: digest of a unit's inputs, and the names of its files
 NOT_LAST = "no"  # value of the option --last
-BY_INPUTS = ("fit", "diagnose")  # the longest stages: a unit with unchanged inputs is copied from the last run
+OF_OTHERS = ("again", "recordings")  # settings of a run that are not of each unit; ``ingest_reads`` has its recordings
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,25 @@ class Job:
     results: Path  # folder of the campaign's results
     content: dict[str, dict[str, Any]] = field(default_factory=dict)  # unit to its settings as JSON values
 
+    @cached_property
+    def members(self) -> dict[str, list[tuple[str, str]]]:
+        """Return the members of the inputs by unit, with their stage; a name may fit several units."""
+        found: dict[str, list[tuple[str, str]]] = {unit: [] for unit in self.units}
+        for stage, pack in self.inputs.items():
+            for name in (n for n in pack.names() if not n.endswith(INPUTS_OF)):
+                folder, _, last = name.rpartition("/")
+                units = {folder.partition("/")[0]}
+                while last:
+                    units.add(last)
+                    last = last[: max(last.rfind("."), last.rfind("_"), 0)]
+                for unit in units & found.keys():
+                    found[unit].append((stage, name))
+        return found
+
+    def state_of_members(self, unit: str) -> list[list[str]]:
+        """Return stage, name and digest of each file of a unit from earlier stages."""
+        return [[stage, name, self.inputs[stage].digest(name)] for stage, name in self.members[unit]]
+
 
 def main(stage: str, argv: Sequence[str]) -> int:
     """Run a step (``pipeline.unit.STEPS``) for each unit, or the function ``<stage>_batch(job)`` for all.
@@ -75,7 +95,9 @@ def main(stage: str, argv: Sequence[str]) -> int:
     ``<stage>_in_batch(job, unit, settings, made)``, if it exists, returns what a step made with what other units of the
     batch tell. ``<stage>_failed(job, unit, settings, failure)``, if it exists, returns the files of a unit that failed
     in this stage or before, and ``<stage>_without`` with the same arguments those that replace the files of a stage
-    after the fit that failed. The exit code is 0 even if units have failed: their failures are part of the output.
+    after the fit that failed. A unit whose settings, code and files of earlier stages are as in the last run is copied
+    from there; ``<stage>_reads(job, unit, settings)``, if it exists, returns what else must be the same, or None where
+    that is not known. The exit code is 0 even if units have failed: their failures are part of the output.
     """
     if stage == "verdict":
         return verdict(argv)
@@ -84,13 +106,13 @@ def main(stage: str, argv: Sequence[str]) -> int:
     if hasattr(module, f"{stage}_batch"):
         getattr(module, f"{stage}_batch")(job)
         return 0
-    last = last_output(job.output)
     edited = job.run.get("again", 0) != repetitions(job.results, _below(job, job.output))[0]
+    last = None if edited else _last_pack(job.output)
     with new_pack(job.output) as add:
         for number, (unit, settings) in enumerate(job.units.items(), 1):
             print(f"{stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
-            inputs = _inputs_of(job, unit) if stage in BY_INPUTS else ""
-            files = _unchanged(last, unit, inputs) if inputs and not edited else {}
+            inputs = _inputs_of(module, job, unit, settings)
+            files = _unchanged(last, unit, inputs) if inputs and last else {}
             if files:
                 print(f"{stage}: {unit} unchanged, taken from the last run", file=sys.stderr, flush=True)
             else:
@@ -98,8 +120,7 @@ def main(stage: str, argv: Sequence[str]) -> int:
             add(files)
             if inputs and not {unit + FAILED, unit + INCOMPLETE} & files.keys():
                 add({unit + INPUTS_OF: as_bytes({"sha256": inputs, "files": [*files]})})
-    if stage in BY_INPUTS:
-        _link_output(job.output)
+    _link_output(job.output)
     record_output(job, job.output)
     return 0
 
@@ -107,6 +128,16 @@ def main(stage: str, argv: Sequence[str]) -> int:
 def last_output(output: Path) -> Path:
     """Return the path of a link to the last output of a job; Snakemake deletes the output before it repeats the job."""
     return output.with_name(f".{output.name}.last")
+
+
+def _last_pack(output: Path) -> Pack | None:
+    """Return the last output of a job; None if there is none, or if it is damaged."""
+    try:
+        pack = Pack(last_output(output))
+        pack.names()
+    except DamagedFileError:
+        return None
+    return pack
 
 
 def _link_output(output: Path) -> None:
@@ -123,26 +154,24 @@ def forget_last_outputs(results: Path) -> None:
         last.unlink()
 
 
-def _inputs_of(job: Job, unit: str) -> str:
-    """Return a digest of a unit's settings, code and files of earlier stages; empty if a file is damaged."""
-    run = {key: value for key, value in job.run.items() if key != "again"}
-    found = hashlib.sha256(json.dumps([run, job.content[unit]], sort_keys=True).encode())
-    prefixes = (f"{unit}.", f"{unit}_")
+def _inputs_of(module: ModuleType, job: Job, unit: str, settings: Settings) -> str:
+    """Return a digest of all that the files of a unit depend on; empty if it is not known."""
+    reads = getattr(module, f"{job.stage}_reads", lambda *_: "")
+    run = {key: value for key, value in job.run.items() if key not in OF_OTHERS}
     try:
-        for pack in job.inputs.values():
-            for name in (n for n in pack.names() if n.startswith(prefixes) and not n.endswith(INPUTS_OF)):
-                found.update(name.encode() + pack.read(name))
-    except DamagedFileError:
+        others = reads(job, unit, settings)
+        found = [run, job.content[unit], job.state_of_members(unit), others]
+    except PipelineError:
         return ""
-    return found.hexdigest()
+    return "" if others is None else hashlib.sha256(json.dumps(found, sort_keys=True).encode()).hexdigest()
 
 
-def _unchanged(last: Path, unit: str, inputs: str) -> dict[str, bytes]:
+def _unchanged(last: Pack, unit: str, inputs: str) -> dict[str, bytes]:
     """Return the files of a unit from the last run; empty if its inputs have changed."""
-    name, pack = unit + INPUTS_OF, Pack(last)
+    name = unit + INPUTS_OF
     try:
-        found = pack.json(name) if last.is_file() and name in pack else {}
-        return {file: pack.read(file) for file in found["files"]} if found.get("sha256") == inputs else {}
+        found = last.json(name) if name in last else {}
+        return {file: last.read(file) for file in found["files"]} if found.get("sha256") == inputs else {}
     except DamagedFileError:
         return {}
 
@@ -154,7 +183,7 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
     parser.add_argument("--output", type=Path, required=True, help="file to write")
     for name in INPUTS[stage]:
         parser.add_argument(f"--{name}", type=Path, required=True, help=f"pack of the stage {name}")
-    for name in OPTIONS.get(stage, ()):
+    for name in ("code", *OPTIONS.get(stage, ())):
         parser.add_argument(f"--{name}", default="", help=f"{name} of this stage")
     arguments = vars(parser.parse_args(argv))
     config: Path = arguments.pop("config")

@@ -100,6 +100,13 @@ def not_calibrated(fits: Mapping[str, Fit], validated: Validation, settings: Set
     return reasons
 
 
+def calibration_reads(job: Job, unit: str, settings: Settings) -> list[Any]:
+    """Return the settings of the other chips of a board, and the state of their files, for its reference chip."""
+    board = settings.stated.board
+    chips = board.chips if board and board.chips[0] == unit else ()
+    return [[chip, job.content[chip], job.state_of_members(chip)] for chip in chips if chip in job.units]
+
+
 def calibration_in_batch(job: Job, unit: str, settings: Settings, document: dict[str, Any]) -> dict[str, Any]:
     """Return the document with what the other units of the batch tell: the chips of a board."""
     board = settings.stated.board

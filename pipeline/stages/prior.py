@@ -46,9 +46,14 @@ def _of_batch(lots: Pack, batch: str) -> Any:  # noqa: ANN401  (a JSON document)
     return lots.json(f"{batch}.json")
 
 
+def prior_reads(job: Job, unit: str, settings: Settings) -> Any:  # noqa: ANN401, ARG001  (a JSON document)
+    """Return the priors of a unit."""
+    return _of_batch(job.inputs["lots"], job.output.parent.name)[unit]
+
+
 def prior_unit(job: Job, unit: str, settings: Settings) -> Files:
     """Return the files that the priors of a unit add or change, by paths relative to the results."""
-    given = _of_batch(job.inputs["lots"], job.output.parent.name)[unit]
+    given = prior_reads(job, unit, settings)
     if not given:
         return {}
     priors = {sensor: UnitPrior.read(prior) for sensor, prior in given.items()}

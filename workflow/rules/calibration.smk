@@ -18,5 +18,5 @@ rule calibration:
     params:
         code=code_digest("pipeline.stages.calibration"),
     shell:
-        "{RUN} calibration --config {input.settings:q} --ingest {input.ingest:q} --accelerometer {input.accelerometer:q}"
+        "{RUN} calibration --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --accelerometer {input.accelerometer:q}"
         " --gyroscope {input.gyroscope:q} --validate {input.validate:q} --diagnose {input.diagnose:q} --output {output:q} > {log:q} 2>&1"

@@ -16,5 +16,5 @@ rule export:
     params:
         code=code_digest("pipeline.stages.export"),
     shell:
-        "{RUN} export --config {input.settings:q} --calibration {input.calibration:q} --validate {input.validate:q}"
+        "{RUN} export --config {input.settings:q} --code {params.code} --calibration {input.calibration:q} --validate {input.validate:q}"
         " --diagnose {input.diagnose:q} --output {output:q} > {log:q} 2>&1"

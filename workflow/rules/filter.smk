@@ -14,4 +14,4 @@ rule filter:
     params:
         code=code_digest("pipeline.stages.filter"),
     shell:
-        "{RUN} filter --config {input.settings:q} --ingest {input.ingest:q} --output {output:q} > {log:q} 2>&1"
+        "{RUN} filter --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --output {output:q} > {log:q} 2>&1"

@@ -43,4 +43,4 @@ rule ingest:
     params:
         code=code_digest("pipeline.stages.ingest"),
     shell:
-        "{RUN} ingest --config {input.settings:q} --recordings={input.recordings:q} --output {output:q} > {log:q} 2>&1"
+        "{RUN} ingest --config {input.settings:q} --code {params.code} --recordings={input.recordings:q} --output {output:q} > {log:q} 2>&1"

@@ -44,6 +44,6 @@ if PLAN["combine"] == "lot":
         params:
             code=code_digest("pipeline.stages.prior"),
         shell:
-            "{RUN} prior --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q}"
+            "{RUN} prior --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q}"
             " --calibration {input.calibration:q} --validate {input.validate:q} --diagnose {input.diagnose:q}"
             " --report {input.report:q} --lots {input.lots:q} --output {output:q} > {log:q} 2>&1"

@@ -19,6 +19,6 @@ rule report:
     params:
         code=code_digest("pipeline.stages.report"),
     shell:
-        "{RUN} report --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q} --calibration {input.calibration:q}"
+        "{RUN} report --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q} --calibration {input.calibration:q}"
         " --validate {input.validate:q} --diagnose {input.diagnose:q}"
         " --export {input.export:q} --output {output:q} > {log:q} 2>&1"

@@ -17,5 +17,5 @@ rule summary:
     params:
         code=code_digest("pipeline.stages.summary"),
     shell:
-        "{RUN} summary --config {input.settings:q} --calibration {input.calibration:q} --validate {input.validate:q}"
+        "{RUN} summary --config {input.settings:q} --code {params.code} --calibration {input.calibration:q} --validate {input.validate:q}"
         " --diagnose {input.diagnose:q} --report {input.report:q} --output {output:q} > {log:q} 2>&1"

@@ -17,5 +17,5 @@ rule validate:
     params:
         code=code_digest("pipeline.stages.validate"),
     shell:
-        "{RUN} validate --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
+        "{RUN} validate --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
         " --gyroscope {input.gyroscope:q} --output {output:q} > {log:q} 2>&1"
