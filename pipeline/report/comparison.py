@@ -120,10 +120,10 @@ def difference(
     ``pairs``: unit to device; with it the differences are those within the devices, each by the mean of its units.
     """
     if pairs is not None:
-        by_device = (group.groupby(group.index.map(pairs), sort=False) for group in (first, second))
-        a, b = (pd.DataFrame({"value": g["value"].mean(), "u": g["u"].agg(_of_mean)}) for g in by_device)
-        devices = a.index.intersection(b.index, sort=False)
-        return mean_of((a["value"] - b["value"])[devices], np.hypot(a["u"], b["u"])[devices])
+        a, b = (_by_device(group, pairs) for group in (first, second))
+        devices = [device for device in a if device in b]
+        changes = np.array([[a[d][0] - b[d][0], math.hypot(a[d][1], b[d][1])] for d in devices]).reshape(-1, 2)
+        return mean_of(*changes.T)
     means = [mean_of(group["value"], group["u"]) for group in (first, second)]
     value, count = means[0].value - means[1].value, means[0].count + means[1].count
     if min(m.count for m in means) > 1:
@@ -135,9 +135,18 @@ def difference(
     return MeanWithUncertainty(value, stated, math.inf, count)
 
 
-def _of_mean(uncertainties: pd.Series[float]) -> float:
+def _by_device(group: pd.DataFrame, pairs: Mapping[str, str]) -> dict[str, tuple[float, float]]:
+    """Return the mean of the units of each device, with its standard uncertainty."""
+    rows: dict[str, list[tuple[float, float]]] = {}
+    for unit, value, u in zip(group.index, group["value"].tolist(), group["u"].tolist(), strict=True):
+        if unit in pairs:
+            rows.setdefault(pairs[unit], []).append((value, u))
+    return {d: (fmean(v for v, _ in units), _of_mean([u for _, u in units])) for d, units in rows.items()}
+
+
+def _of_mean(uncertainties: ArrayLike) -> float:
     """Return the standard uncertainty of the mean of independent values."""
-    return float(np.linalg.norm(uncertainties)) / max(len(uncertainties), 1)
+    return float(np.linalg.norm(u := np.asarray(uncertainties))) / max(u.size, 1)
 
 
 def adjusted(p_values: Sequence[float]) -> list[float]:

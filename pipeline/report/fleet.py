@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import io
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -40,6 +40,12 @@ from pipeline.report.parameters import PARAMETER_KEYS, SUMMARY_COLUMNS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Mask, Values
+
+    Texts = NDArray[np.object_]
 
 # units, below which a median absolute deviation is too uncertain: its standard deviation is 17 % of it
 MIN_UNITS_OF_DEVIATION = 20
@@ -64,6 +70,22 @@ def wide(parameters: pd.DataFrame, units: Sequence[str], name: str, *figures: st
     return [pd.DataFrame(cells[f].to_numpy().reshape(len(units), len(names)), units, names) for f in figures]
 
 
+class ValuesOfUnits(NamedTuple):
+    """The values of a parameter, one a unit; texts are None, figures NaN where nothing is stated."""
+
+    unit: Texts
+    lot: Texts
+    serial: Texts
+    day: Values  # since 1970
+    value: Values
+    u: Values
+    U: Values
+
+    def where(self, rows: Mask) -> ValuesOfUnits:
+        """Return some of the units."""
+        return ValuesOfUnits._make(column[rows] for column in self)
+
+
 def fleet_statistics(rows: Sequence[JSON], parameters: pd.DataFrame) -> JSON:
     """Return the statistics of a fleet, ``fleet.json``: a list of dicts for each statistic, and ``missing``.
 
@@ -73,90 +95,107 @@ def fleet_statistics(rows: Sequence[JSON], parameters: pd.DataFrame) -> JSON:
     units = units.rename(columns={"sensor": "model"}).dropna(subset=["model", "method"])
     units["day"] = (pd.to_datetime(units["date"], format="%Y-%m-%d", errors="coerce") - pd.Timestamp(0)).dt.days
     known = units.merge(parameters[parameters["fitted"]], on="unit")
+    texts = {key: known[key].astype(object).where(known[key].notna(), None).to_numpy() for key in ("lot", "serial")}
+    figures = {key: known[key].to_numpy(np.float64, na_value=np.nan) for key in ("day", "value", "u", "U")}
+    table = ValuesOfUnits(known["unit"].to_numpy(object), **texts, **figures)
+    keys = list(zip(known["model"], known["method"], strict=True))
+    groups: dict[tuple[str, str], dict[str, list[int]]] = {key: {} for key in keys}  # parameter to its rows
+    names, measures = known["parameter"].tolist(), known["measure"].tolist()
+    for row in np.argsort(known["sensor"].to_numpy(str), kind="stable").tolist():
+        groups[keys[row]].setdefault(names[row], []).append(row)
     out: JSON = {key: [] for key in STATISTICS}
-    for (model, method), siblings in known.groupby(["model", "method"], sort=False):
-        of_siblings = siblings.sort_values("sensor", kind="stable").groupby("parameter", sort=False)
-        for name, table in of_siblings:
-            about = {"sensor": model, "method": method, "parameter": name, "unit": table["measure"].iloc[0]}
-            for key, statistic in STATISTICS.items():
-                out[key] += [about | found for found in statistic(table, len(of_siblings))]
+    for (model, method), of_siblings in groups.items():
+        for name, members in of_siblings.items():
+            about = {"sensor": model, "method": method, "parameter": name, "unit": measures[members[0]]}
+            values = table.where(np.array(members))
+            values = values.where(np.isfinite(values.value))
+            for key, statistic in STATISTICS.items() if len(values.value) else ():
+                out[key] += [about | found for found in statistic(values, len(of_siblings))]
     out["far"].sort(key=lambda f: -abs(f["z"]))
     out["missing"] = _missing_effects(rows)
     return out
 
 
-def _spread(values: pd.Series[float]) -> float:
+def _spread(values: Values) -> float:
     """Return 1.4826 times the median absolute deviation: the standard deviation where the values are normal."""
-    return float(MEDIAN_SIZE * (values - values.median()).abs().median())
+    return float(MEDIAN_SIZE * np.median(np.abs(values - np.median(values))))
 
 
-def _distributions(table: pd.DataFrame, _: int) -> Iterable[JSON]:
-    v = table["value"]
-    low, middle, high = v.quantile([0.05, 0.5, 0.95]).tolist()
-    found = {"units": int(v.count()), "median": middle, "robust_standard_deviation": _spread(v)}
+def _distributions(table: ValuesOfUnits, _: int) -> Iterable[JSON]:
+    v = table.value
+    low, middle, high = np.percentile(v, [5.0, 50.0, 95.0]).tolist()
+    found = {"units": len(v), "median": middle, "robust_standard_deviation": _spread(v)}
     yield found | {"quantile_05": low, "quantile_95": high, "smallest": float(v.min()), "largest": float(v.max())}
 
 
-def _far(table: pd.DataFrame, _: int) -> Iterable[JSON]:
-    v, spread = table["value"], _spread(table["value"])
-    if v.count() >= MIN_UNITS_OF_DEVIATION and spread > 0.0:
-        far = table.assign(z=(v - v.median()) / spread)
-        for unit in far[far["z"].abs() > OUTLIER_DEVIATIONS].to_dict("records"):
-            lot = unit["lot"] if isinstance(unit["lot"], str) else None
-            yield {"name": unit["unit"], "lot": lot, "value": unit["value"], "z": unit["z"]}
+def _far(table: ValuesOfUnits, _: int) -> Iterable[JSON]:
+    v, spread = table.value, _spread(table.value)
+    if len(v) >= MIN_UNITS_OF_DEVIATION and spread > 0.0:
+        z = (v - np.median(v)) / spread
+        for i in np.flatnonzero(np.abs(z) > OUTLIER_DEVIATIONS):
+            yield {"name": table.unit[i], "lot": table.lot[i], "value": float(v[i]), "z": float(z[i])}
 
 
-def _drift(table: pd.DataFrame, parameters: int) -> Iterable[JSON]:
-    known = table[["day", "value"]].dropna()
-    if len(known) < MIN_UNITS_OF_DEVIATION or known.nunique().min() == 1:  # dates or values that are all the same
+def _drift(table: ValuesOfUnits, parameters: int) -> Iterable[JSON]:
+    known = table.where(np.isfinite(table.day))
+    if len(known.day) < MIN_UNITS_OF_DEVIATION or np.ptp(known.day) == 0.0 or np.ptp(known.value) == 0.0:
         return
     from scipy import stats  # noqa: PLC0415  (0.3 s that few fleets need)
 
-    rho, p = stats.spearmanr(known["day"], known["value"])
+    rho, p = stats.spearmanr(known.day, known.value)
     if p * parameters < FLEET_TEST_LEVEL:
-        some = known.iloc[:: -(-len(known) // MOST_PAIRED)]
-        slope = float(stats.theilslopes(some["value"], some["day"]).slope)
+        step = -(-len(known.day) // MOST_PAIRED)
+        slope = float(stats.theilslopes(known.value[::step], known.day[::step]).slope)
         found = {"rank_correlation": float(rho), "p_value": float(p), "per_year": slope * DAYS_OF_A_YEAR}
-        yield found | {"units": len(known)}
+        yield found | {"units": len(known.day)}
 
 
-def _lots(table: pd.DataFrame, parameters: int) -> Iterable[JSON]:
-    values = table["value"].dropna()
-    lots = {lot: v for lot, v in values.groupby(table["lot"]) if len(v) >= 3}
+def _lots(table: ValuesOfUnits, parameters: int) -> Iterable[JSON]:
+    values = table.value
+    lots = {lot: values[rows] for lot, rows in _by_name(table.lot).items() if len(rows) >= 3}
     if len(values) < MIN_UNITS_OF_DEVIATION or len(lots) < 2 or np.ptp(values) == 0.0:
         return
     from scipy import stats  # noqa: PLC0415  (0.3 s that only lots need)
 
     p = float(stats.kruskal(*lots.values()).pvalue)
     if p * parameters < FLEET_TEST_LEVEL:
-        medians, middle = {lot: float(v.median()) for lot, v in lots.items()}, float(values.median())
+        medians, middle = {lot: float(np.median(v)) for lot, v in lots.items()}, float(np.median(values))
         lot = max(medians, key=lambda lot: abs(medians[lot] - middle))
         yield {"p_value": p, "lot": lot, "lot_median": medians[lot], "median": middle}
 
 
-def _repeatability(table: pd.DataFrame, parameters: int) -> Iterable[JSON]:
+def _by_name(names: Texts) -> dict[str, list[int]]:
+    """Return the rows of each name, in the order of the names; those without a name are left out."""
+    rows: dict[str, list[int]] = {name: [] for name in sorted({name for name in names if name is not None})}
+    for row, name in enumerate(names):
+        if name is not None:
+            rows[name].append(row)
+    return rows
+
+
+def _repeatability(table: ValuesOfUnits, parameters: int) -> Iterable[JSON]:
     """Return the scatter of the calibrations of one device, pooled over devices with several calibrations."""
-    table = table.dropna(subset=["serial", "value"])
-    table = table[table["serial"].duplicated(keep=False)]
-    if table.empty:
+    devices = [table.where(np.array(rows)) for rows in _by_name(table.serial).values() if len(rows) > 1]
+    if not devices:
         return
-    devices = table.groupby("serial")["value"]
-    squares, freedom = float(((table["value"] - devices.transform("mean")) ** 2).sum()), len(table) - devices.ngroups
-    found = {"devices": devices.ngroups, "calibrations": len(table), "standard_deviation": math.sqrt(squares / freedom)}
-    yield found | _against_stated(table.dropna(subset=["u", "U"]), parameters)
+    calibrations = sum(len(device.value) for device in devices)
+    squares = sum(float(np.sum((device.value - np.mean(device.value)) ** 2)) for device in devices)
+    scatter = math.sqrt(squares / (calibrations - len(devices)))
+    found = {"devices": len(devices), "calibrations": calibrations, "standard_deviation": scatter}
+    yield found | _against_stated(devices, parameters)
 
 
-def _against_stated(known: pd.DataFrame, parameters: int) -> JSON:
+def _against_stated(devices: Sequence[ValuesOfUnits], parameters: int) -> JSON:
     """Return chi-square, its degrees of freedom and p-value, and the largest E_n; nothing without uncertainties."""
-    known = known[(known["u"] > 0.0) & known["serial"].duplicated(keep=False)]
-    if known.empty:
+    known = [device.where((device.u > 0.0) & np.isfinite(device.U)) for device in devices]
+    known = [device for device in known if len(device.value) > 1]
+    if not known:
         return {}
     from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only repeated calibrations need)
 
     chi, freedom, largest = 0.0, 0, 0.0
-    for _, device in known.groupby("serial"):
-        value, w, U = (device[key].to_numpy() for key in ("value", "u", "U"))
-        w = 1.0 / w**2
+    for device in known:
+        value, w, U = device.value, 1.0 / device.u**2, device.U
         chi += float(np.sum(w * (value - np.sum(w * value) / np.sum(w)) ** 2))
         freedom += len(value) - 1
         largest = max(largest, float(np.max(np.abs(value[:, None] - value) / np.hypot(U[:, None], U))))
