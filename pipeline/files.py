@@ -7,6 +7,7 @@ makes it survive a power failure. It takes some milliseconds, so a job that writ
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import json
 import math
 import os
@@ -20,7 +21,7 @@ from pipeline.errors import DamagedFileError
 JSON: TypeAlias = dict[str, Any]  # a document, or a part of one
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
 _PACKAGE = Path(__file__).resolve().parent
 INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
@@ -57,6 +58,15 @@ def write_atomically(path: Path, content: str | bytes) -> None:
             stream.flush()
             os.fsync(stream.fileno())
     temporary.replace(path)
+
+
+def state_of_files(files: Iterable[Path]) -> str:
+    """Return a digest of the names, sizes and times of files."""
+    digest = hashlib.sha256()
+    for file in sorted(files):
+        status = file.stat()
+        digest.update(f"{file}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
+    return digest.hexdigest()[:16]
 
 
 def read_json(path: Path, read: Callable[[Path], bytes] = Path.read_bytes) -> Any:  # noqa: ANN401  (any JSON value)

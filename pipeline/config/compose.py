@@ -11,17 +11,15 @@ overrides do not change.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
+from copy import deepcopy
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
 
 from imu_logs.profile import checks_of, csv_formats, mcap_formats
@@ -46,17 +44,16 @@ from pipeline.config.user_effects import (
 )
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.stages import NOT_WANTED, check_stages, declared
-from pipeline.files import CONFIGS
+from pipeline.files import CONFIGS, state_of_files
 from pipeline.history import SENSORS
 from pipeline.io.files import candidate_files
 from pipeline.io.recordings_sheet import with_sheet
 from pipeline.model.sensor_file import completed, range_settings, without_overridden
 from pipeline.settings import OF_BENCH, SECTIONS, Ingest, Method, Procedure, Section, Sensor, Settings, Stages, Unit
+from pipeline.user_cache import from_cache, to_cache
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
-
-    from omegaconf import DictConfig
 
 Groups: TypeAlias = tuple[tuple[str, str], ...]  # group and option
 INSTANCE = "${ingest.instance}"
@@ -194,12 +191,7 @@ class Composer:
         """Return the configuration that Hydra composes from a choice of groups, and whether it contains references."""
         key = tuple(sorted(groups.items()))
         if key not in self._bases:
-            try:
-                composed = _compose(key, tuple(self.searchpath), self.state)
-            except (HydraException, OmegaConfBaseException) as error:
-                cause = f" ({error.__cause__})" if error.__cause__ else ""
-                raise Problem(f"{str(error).splitlines()[0]}{cause}") from error
-            base: Any = OmegaConf.to_container(composed, resolve=False)
+            base = deepcopy(_composed(key, tuple(self.searchpath), self.state))
             plain: dict[str, Any] = {str(k): v for k, v in base.items() if k not in RUN_SETTINGS}
             for group in GROUPS:
                 option = groups.get(group) or default_option(group)
@@ -299,11 +291,32 @@ class Composer:
 
 
 @lru_cache(maxsize=256)  # commands and notebooks load a campaign several times
-def _compose(groups: Groups, folders: Sequence[Path], *_: object) -> DictConfig:
-    """Compose a choice of groups with Hydra, with options from the folders of a campaign.
+def _composed(groups: Groups, folders: Sequence[Path], *_: object) -> dict[Any, Any]:
+    """Return what Hydra composes from a choice of groups, with options from the folders of a campaign.
 
-    The other arguments are those that change with the files in these folders.
+    The other arguments are those that change with the files in these folders. A choice of shipped options is kept in
+    the user's cache. Raises ``Problem``.
     """
+    if folders:
+        return _compose(groups, folders)
+    hydra = find_spec("hydra")
+    assert hydra is not None and hydra.origin is not None  # noqa: PT018, S101  (for the type checker)
+    name = f"configuration-{hashlib.sha256(repr(groups).encode()).hexdigest()[:16]}"
+    state = state_of_files([Path(hydra.origin), *CONFIGS.rglob("*.yaml")])
+    found = from_cache(name, state)
+    if not isinstance(found, dict):
+        found = _compose(groups, ())
+        to_cache(name, state, found)
+    return found
+
+
+def _compose(groups: Groups, folders: Sequence[Path]) -> dict[Any, Any]:
+    from hydra import compose, initialize_config_dir  # noqa: PLC0415  (0.1 s, where the cache lacks a choice)
+    from hydra.core.global_hydra import GlobalHydra  # noqa: PLC0415
+    from hydra.errors import HydraException  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
+
     overrides = [f"{group}={option}" for group, option in groups]
     if folders:
         overrides.append(f"hydra.searchpath=[{','.join(map(_quoted, folders))}]")
@@ -311,7 +324,11 @@ def _compose(groups: Groups, folders: Sequence[Path], *_: object) -> DictConfig:
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            return compose("config", overrides)
+            composed: Any = OmegaConf.to_container(compose("config", overrides), resolve=False)
+            return dict(composed)
+    except (HydraException, OmegaConfBaseException) as error:
+        cause = f" ({error.__cause__})" if error.__cause__ else ""
+        raise Problem(f"{str(error).splitlines()[0]}{cause}") from error
     finally:
         GlobalHydra.instance().hydra = before
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pipeline.config.user_effects import effects_for
 from pipeline.files import CONFIGS, canonical_json
 from pipeline.history import SENSORS, digest
-from pipeline.io.files import state_of_files
+from pipeline.io.files import state_of_recordings
 from pipeline.settings import Board, Settings, Stated, Unit
 from pipeline.unit import STEPS
 
@@ -154,7 +154,7 @@ def _recordings(campaign: Campaign, rows: Sequence[UnitRow]) -> dict[str, str] |
     """Return the state of the recordings of each unit; None if the run simulates them."""
     if campaign.simulation:
         return None
-    return {r.name: state_of_files(r.config.procedure, r.config.ingest, campaign.folder(r.name)) for r in rows}
+    return {r.name: state_of_recordings(r.config.procedure, r.config.ingest, campaign.folder(r.name)) for r in rows}
 
 
 def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, FileSystemLoader, Template
 
+from pipeline.compiled_templates import CompiledTemplates
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed
 from pipeline.estimation.free_curves import OTHER_PREFIX
 from pipeline.model.effects import catalogue
@@ -49,6 +50,7 @@ def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
         auto_reload=False,
+        bytecode_cache=CompiledTemplates("diagnosis"),
         autoescape=False,  # noqa: S701  (no HTML)
         trim_blocks=True,
         lstrip_blocks=True,

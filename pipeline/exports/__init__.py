@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
+from pipeline.compiled_templates import CompiledTemplates
 from pipeline.errors import ConfigurationError
 from pipeline.exports.sensors import (
     TEMPLATE_FUNCTIONS,
@@ -92,6 +93,7 @@ def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         auto_reload=False,
+        bytecode_cache=CompiledTemplates("exports"),
         autoescape=False,  # noqa: S701  (no HTML; each comment filter closes its own comments)
         trim_blocks=True,
         lstrip_blocks=True,

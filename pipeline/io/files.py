@@ -7,7 +7,6 @@ message logs, joined on time), they replace the ``.csv``.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from imu_logs.files import SUFFIXES
 from pipeline.errors import ConfigurationError
+from pipeline.files import state_of_files
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -43,15 +43,11 @@ def recording_files(procedure: Procedure, ingest: Ingest, folder: Path) -> dict[
     return found
 
 
-def state_of_files(procedure: Procedure, ingest: Ingest, folder: Path) -> str:
+def state_of_recordings(procedure: Procedure, ingest: Ingest, folder: Path) -> str:
     """Return a digest of the names, sizes and times of the files of a unit's recordings, and of their sheet."""
     sheets = [path for path in [folder / (procedure.sheet or "")] if path.is_file()]
     files = recording_files(procedure, ingest, folder).values()
-    digest = hashlib.sha256()
-    for path in sorted({*sheets, *(path for paths in files for path in paths)}):
-        status = path.stat()
-        digest.update(f"{path}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
-    return digest.hexdigest()[:16]
+    return state_of_files({*sheets, *(path for paths in files for path in paths)})
 
 
 def candidate_files(procedure: Procedure, ingest: Ingest) -> dict[str, list[list[str]]]:

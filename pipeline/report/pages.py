@@ -13,6 +13,7 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader, Template, select_autoescape
 from markupsafe import Markup
 
+from pipeline.compiled_templates import CompiledTemplates
 from pipeline.estimation.candidates import is_fixed
 from pipeline.report import numbers
 from pipeline.report.numbers import Scale, measured, number, plain, unit_text
@@ -48,6 +49,7 @@ def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         auto_reload=False,
+        bytecode_cache=CompiledTemplates("report"),
         autoescape=select_autoescape(disabled_extensions=["md", "txt", "yaml"], default=True),
         trim_blocks=True,
         lstrip_blocks=True,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from imu_logs.files import unchanged
 from pipeline.errors import IngestError, PipelineError, failure_of
-from pipeline.io.files import candidate_files, recording_files, state_of_files
+from pipeline.io.files import candidate_files, recording_files, state_of_recordings
 from pipeline.io.read import read_recordings
 from pipeline.pack import FAILED, Pack, as_bytes, new_pack
 from pipeline.preprocessing.checks import check_recordings
@@ -91,7 +91,7 @@ def ingest_reads(job: Job, unit: str, settings: Settings) -> str | None:
     if job.run["recordings"] is not None:
         return str(job.run["recordings"][unit])
     folder = Path(job.run["directory"], settings.procedure.folder)
-    return None if "recordings" in job.inputs else state_of_files(settings.procedure, settings.ingest, folder)
+    return None if "recordings" in job.inputs else state_of_recordings(settings.procedure, settings.ingest, folder)
 
 
 def _ingested(files: UnitFiles, settings: Settings) -> list[Recording]:

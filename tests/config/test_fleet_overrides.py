@@ -176,6 +176,18 @@ def test_numbers_are_read_as_hydra_reads_them(text: str) -> None:
     assert (key, type(value), value) == (override.key_or_group, type(override.value()), override.value())
 
 
+@settings(max_examples=60)
+@given(
+    st.from_regex(r"[a-z_]{1,8}(\.[a-z_]{1,8}){0,2}=[A-Za-z_][A-Za-z0-9_./-]{0,12}", fullmatch=True)
+    | st.sampled_from(["a=" + word for word in ("null", "NULL", "true", "False", "nan", "Inf", "inf.", "nul", "e-5")])
+)
+def test_words_and_paths_are_read_as_hydra_reads_them(text: str) -> None:
+    (key, value), override = parse(text), HYDRA.parse_override(text)
+    read = override.value()
+    assert (key, type(value)) == (override.key_or_group, type(read))
+    assert value == read or (value != value and read != read)  # noqa: PLR0124  (both NaN)
+
+
 JSON = st.recursive(
     st.integers(0, 2) | st.none() | st.lists(st.integers(0, 1), max_size=1),
     lambda below: st.dictionaries(st.sampled_from("abc"), below, max_size=3),
