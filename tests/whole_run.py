@@ -46,7 +46,6 @@ def run_jobs(campaign: Campaign, stages: Collection[str] = tuple(batch.INPUTS)) 
             earlier = chain[: chain.index(last)]
             previous = folder / "fit" / sensor / f"{earlier[-1]}.zip" if earlier else ""
             options = ["--sensor", sensor, "--stage", last, f"--previous={previous}"]
-            options += ["--last", "yes" if last == chain[-1] else "no"]
         of_all = {"gather": batches / "gathered.json", "lots": batches / "lots.zip"}
         target = of_all.get(stage, folder / f"{output}.zip")
         given = [word for of, path in inputs.items() for word in (f"--{of}", str(path))]

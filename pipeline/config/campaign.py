@@ -36,11 +36,12 @@ from pydantic import ValidationError
 from pipeline.config.compose import Composer
 from pipeline.config.layers import as_list, load_layers
 from pipeline.config.options import GROUPS, RUN_SETTINGS, Problem, mapping_of, nearest, parse
-from pipeline.config.user_effects import GIVEN, PYTHON
+from pipeline.config.stage_settings import EFFECTS_STAGE, last_stage
+from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError, first
 from pipeline.files import CONFIGS, JSON, SHIPPED, canonical_json
 from pipeline.history import SENSORS
-from pipeline.settings import OF_BENCH, RunSettings
+from pipeline.settings import RunSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -237,11 +238,9 @@ def cut_batches(
             batch = f"{chain}-{number:04d}"
             batches[batch] = names[start:stop]
             configs = [units[n].config for n in batches[batch]]
-            of_bench = any(getattr(c.table, key) for c in configs for key in OF_BENCH)
-            wanted = {sensor: of_bench or any(c.effects.of(sensor) for c in configs) for sensor in SENSORS}
-            method = configs[0].method
-            effects = {sensor: wanted[sensor] and method.of(sensor) != GIVEN for sensor in SENSORS}
-            chains[batch] = {s: [*(method.stages.of(s) or ()), *["effects"] * effects[s]] for s in SENSORS}
+            stages = {sensor: list(configs[0].method.stages.of(sensor) or ()) for sensor in SENSORS}
+            effects = {sensor: any(last_stage(c, sensor) == EFFECTS_STAGE for c in configs) for sensor in SENSORS}
+            chains[batch] = {sensor: [*stages[sensor], *[EFFECTS_STAGE] * effects[sensor]] for sensor in SENSORS}
             start = stop
     return batches, chains
 

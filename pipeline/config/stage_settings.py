@@ -14,11 +14,11 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipeline.config.user_effects import effects_for
+from pipeline.config.user_effects import GIVEN, effects_for
 from pipeline.files import CONFIGS, canonical_json
 from pipeline.history import SENSORS, digest
 from pipeline.io.files import state_of_recordings
-from pipeline.settings import Board, Settings, Stated, Unit
+from pipeline.settings import OF_BENCH, Board, Settings, Stated, Unit
 from pipeline.unit import STEPS
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 PACKAGE = Path(__file__).resolve().parents[1]
 PACKAGES = ("pipeline", "imu_logs")  # beside each other, in a clone and in a wheel
+EFFECTS_STAGE = "effects"  # of a fit
 CAMPAIGN = "campaign"  # cannot be a batch, because their names end in a number
 EFFECTS_FOLDER = CONFIGS / "effect"  # read by pipeline.model.effects
 # An import of the package, or of jinja2: module and names, or only a module. ``ast`` takes 0.5 s for all files.
@@ -39,11 +40,19 @@ SECTIONS_OF_STAGES = {**{name: step.settings for name, step in STEPS.items()}, "
 
 def sections_of(stage: str, sensor: str, settings: Settings) -> tuple[str, ...]:
     """Return the sections that a stage reads: a key of ``SECTIONS_OF_STAGES``, or ``effects`` of a sensor's fit."""
-    if stage != "effects":
+    if stage != EFFECTS_STAGE:
         return SECTIONS_OF_STAGES[stage]
     mounted = settings.table.seat_deg is not None or "mounting" in settings.effects.gyroscope
     both = sensor == "gyroscope" and mounted  # gravity determines the mounting of the unit in each recording
     return (*SECTIONS_OF_STAGES["fit"], f"effects.{sensor}", *(["effects.accelerometer"] if both else []))
+
+
+def last_stage(settings: Settings, sensor: str) -> str:
+    """Return the last stage of a unit's fit; a batch has the stage ``effects`` where some of its units have it."""
+    method, of_bench = settings.method, any(getattr(settings.table, key) for key in OF_BENCH)
+    if method.of(sensor) != GIVEN and (of_bench or settings.effects.of(sensor)):
+        return EFFECTS_STAGE
+    return (method.stages.of(sensor) or [""])[-1]
 
 
 def settings_of_unit(unit: UnitRow, stage: str, sensor: str, stated: Stated) -> dict[str, Any]:
@@ -100,7 +109,7 @@ def settings_of_jobs(
     for batch, units in campaign.batches.items():
         rows = [campaign.units[unit] for unit in units]
         fits = [(s, stage) for s in SENSORS for stage in campaign.chains[batch][s]]
-        outputs = {f"fit/{s}/{stage}": (stage if stage == "effects" else "fit", s) for s, stage in fits}
+        outputs = {f"fit/{s}/{stage}": (stage if stage == EFFECTS_STAGE else "fit", s) for s, stage in fits}
         outputs |= {stage: (stage, "") for stage in SECTIONS_OF_STAGES if stage not in ("fit", "prior")}
         outputs |= {"prior": ("prior", "")} if campaign.combine == "lot" else {}
         files[batch] = {
@@ -143,6 +152,8 @@ def _content(
         settings[row.name] = settings_of_unit(row, stage, sensor, stated)
     content: dict[str, Any] = dict(zip(("common", "units"), in_common(settings), strict=True))
     content |= effects_for(stage, sensor, [r.config for r in rows])
+    if sensor:
+        content["last"] = {row.name: last_stage(row.config, sensor) for row in rows}
     if stage in ("ingest", "report"):
         content["campaign"] = campaign.name
     if stage == "ingest":

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from types import ModuleType
 
-FITS = ("accelerometer", "gyroscope")
+FITS, EFFECTS_STAGE = ("accelerometer", "gyroscope"), "effects"
 INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "collect": (),
     "ingest": (),
@@ -49,11 +49,14 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "prior": ("ingest", "filter", "calibration", "validate", "diagnose", "report", "lots"),
     "gather": (),
 }
-OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous", "last")}
+OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous")}
 AFTER_FIT = ("diagnose", "export", "report", "summary", "prior")  # a calibration does not depend on them
 INPUTS_OF = ".inputs"  # member of a pack: digest of a unit's inputs, and the names of its files
-NOT_LAST = "no"  # value of the option --last
-OF_OTHERS = ("again", "recordings")  # settings of a run that are not of each unit; ``ingest_reads`` has its recordings
+OF_OTHERS = (
+    "again",
+    "recordings",
+    "last",
+)  # settings by unit, of which ``<stage>_reads`` returns those of one
 
 
 @dataclass(frozen=True)
@@ -267,8 +270,10 @@ def _made(module: ModuleType, job: Job, unit: str, settings: Settings) -> Files:
         return files
     from pipeline.stages.unit_files import FILES, StoredUnit  # noqa: PLC0415  (numpy, for the jobs only)
 
-    run = job.run
-    task = Task(job.stage, run.get("sensor", ""), run.get("stage", ""), last=run.get("last") != NOT_LAST)
+    stage, last = job.run.get("stage", ""), job.run.get("last", {}).get(unit, "")
+    if stage == EFFECTS_STAGE != last:  # other units of the batch have effects
+        return {f"{unit}.json": job.inputs["previous"].read(f"{unit}.json")}
+    task = Task(job.stage, job.run.get("sensor", ""), stage, last=stage == last)
     made = run_step(task, StoredUnit(job, unit), settings)
     of_batch = getattr(module, f"{job.stage}_in_batch", None)
     return FILES[job.stage](unit, of_batch(job, unit, settings, made) if of_batch else made)

@@ -15,6 +15,12 @@ if TYPE_CHECKING:
 
     from pipeline.records import Fit, UnitRecordings
     from pipeline.settings import Settings
+    from pipeline.stages.batch import Job
+
+
+def fit_reads(job: Job, unit: str, settings: Settings) -> str:  # noqa: ARG001
+    """Return the last stage of the fit of a unit."""
+    return str(job.run["last"][unit])
 
 
 def fit(

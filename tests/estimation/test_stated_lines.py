@@ -246,13 +246,13 @@ def test_a_chain_of_stages_counts_what_is_stated_once(tmp_path: Path) -> None:
     turns = [r.select(np.abs(r.table_rate) > 1.0) for r in bench.turns_at([60.0, -60.0])]  # without a rest in them
     still = replace(bench.turns_at([0.0])[0], name="static", role="static")
     part = sheet(repeatability_bias=0.02).only(STEPS["fit"].settings)
-    (tmp_path / "part.json").write_text(json.dumps({"units": {"U": part}}))
+    (tmp_path / "part.json").write_text(json.dumps({"units": {"U": part}, "last": {"U": "cholesky_lu"}}))
     stages = [tmp_path / "bias", tmp_path / "cholesky_lu"]
     ingested = write_pack(tmp_path / "ingest.zip", {"U.parquet": to_parquet([*turns, still])})
     recordings = filter_recordings([*turns, still], settings())
     filtered = write_pack(tmp_path / "filter.zip", FILES["filter"]("U", recordings))
-    for stage, previous, last in zip(stages, ["", str(stages[0])], ["no", "yes"], strict=True):
-        chosen = ["--sensor", "gyroscope", "--stage", stage.name, "--previous", previous, "--last", last]
+    for stage, previous in zip(stages, ["", str(stages[0])], strict=True):
+        chosen = ["--sensor", "gyroscope", "--stage", stage.name, "--previous", previous]
         folders = ["--config", str(tmp_path / "part.json"), "--output", str(stage)]
         folders += ["--ingest", str(ingested), "--filter", str(filtered)]
         batch.main("fit", [*folders, *chosen])

@@ -9,7 +9,9 @@ import pytest
 
 from pipeline.pack import Pack, new_pack
 from pipeline.results_folder import repetitions
-from pipeline.stages import batch
+from pipeline.settings import Settings
+from pipeline.stages import batch, calibration
+from pipeline.stages import prior as prior_stage
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -75,3 +77,33 @@ def test_an_edited_output_is_computed_again_once(run, tmp_path: Path) -> None:  
     assert run(again=again) == ["U1", "U10"]
     assert repetitions(results, output) == (1, [])
     assert run(again=again) == []
+
+
+def test_the_reference_chip_of_a_board_depends_on_the_other_chips(tmp_path: Path) -> None:
+    board = {"stated": {"board": {"name": "B", "chips": ["U1", "U2"]}}}
+    units = {unit: Settings.of_sections(board) for unit in ("U1", "U2", "U3")}
+
+    def inputs(**recordings: bytes) -> dict[str, str]:
+        with new_pack(tmp_path / "ingest.zip") as add:
+            add({f"{unit}.parquet": recordings.get(unit, b"x") for unit in units})
+        packs = {"ingest": Pack(tmp_path / "ingest.zip")}
+        job = batch.Job("calibration", units, {}, packs, tmp_path / "out.zip", tmp_path, dict.fromkeys(units, board))
+        return {unit: batch._inputs_of(calibration, job, unit, settings) for unit, settings in units.items()}
+
+    before = inputs()
+    assert {unit for unit, found in inputs(U2=b"y").items() if found != before[unit]} == {"U1", "U2"}
+    assert {unit for unit, found in inputs(U1=b"y").items() if found != before[unit]} == {"U1"}
+
+
+def test_a_unit_depends_on_the_prior_of_its_lot(tmp_path: Path) -> None:
+    settings = Settings.of_sections({})
+
+    def inputs(folder: str, prior: float) -> str:
+        (tmp_path / folder).mkdir()
+        with new_pack(tmp_path / folder / "lots.zip") as add:
+            add({"b.json": json.dumps({"U1": {"accelerometer": prior}}).encode()})
+        packs, output = {"lots": Pack(tmp_path / folder / "lots.zip")}, tmp_path / "b" / "prior.zip"
+        job = batch.Job("prior", {"U1": settings}, {}, packs, output, tmp_path, {"U1": {}})
+        return batch._inputs_of(prior_stage, job, "U1", settings)
+
+    assert inputs("one", 1.0) == inputs("same", 1.0) != inputs("other", 2.0)

@@ -196,11 +196,6 @@ def code_of_fit(wildcards):
     return "".join(code_digest(module) for module in modules)
 
 
-def is_last_stage(wildcards):
-    chain = PLAN["chains"][wildcards.batch][wildcards.sensor]
-    return "yes" if wildcards.stage == chain[-1] else "no"
-
-
 def pages(wildcards):
     """Return the published pages that exist, for `snakemake --report`."""
     shown = {

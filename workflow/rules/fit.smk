@@ -17,8 +17,7 @@ rule fit:
         runtime=10,
     params:
         code=code_of_fit,
-        last=is_last_stage,
     shell:
         "{RUN} fit --config {input.settings:q} --sensor {wildcards.sensor} --stage {wildcards.stage}"
-        " --last {params.last} --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q} --previous={input.previous:q} --output {output:q}"
+        " --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q} --previous={input.previous:q} --output {output:q}"
         " > {log:q} 2>&1"
