@@ -26,7 +26,9 @@ GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certifi
 RUN_SETTINGS = tuple(RunSettings.model_fields)
 LARGEST_CONFIG = 10_000  # values of an option; the largest in configs/ has 160
 NUMBER_OVERRIDE = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
-WORD_OVERRIDE = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=([A-Za-z_][A-Za-z_0-9./-]*)")  # a text or a path
+WORD_OVERRIDE = re.compile(
+    r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=([A-Za-z_][A-Za-z_0-9./-]*)"
+)  # a text or a path
 NOT_TEXTS = ("null", "true", "false", "nan", "inf")
 REFERENCE_TOKEN = re.compile(r"(\\\$\{)|\$\{\s*([A-Za-z_]\w*(?:\.\w+)+)\s*\}|\$\{")
 MAX_REFERENCE_LENGTH = 10_000  # characters of a value with references, such as a name or a unit

@@ -32,6 +32,7 @@ from pipeline.files import CONFIGS
 from pipeline.io.files import wrong_name
 from pipeline.model.sensor_file import completed
 from pipeline.settings import SECTIONS, Settings
+from pipeline.simulation import REST_BY_HAND_S
 from pipeline.simulation.procedures import (
     FERRARIS,
     ONE_RECORDING,
@@ -52,7 +53,7 @@ DESCRIPTION_KINDS = ("rows", "file", "program")
 _, BY_FILE, BY_PROGRAM = DESCRIPTION_KINDS
 UNITS_OF_A_LOT = 25  # for units that are described by a count: a round number
 # By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
-COURSE_BY_HAND = Course(dwell_s=4.0, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
+COURSE_BY_HAND = Course(dwell_s=REST_BY_HAND_S, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
 # Each turn there and back, the second held out between rests of 4 s or longer; 360 deg in some 3 s.
 FACES_AND_TURNS = replace(COURSE_BY_HAND, dwell_s=5.0, rates_dps=(120.0,), both_directions=True)
 RECORDED = ("sensor", "table", "procedure", "samples", "interval_s", "lost")

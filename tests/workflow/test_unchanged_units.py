@@ -95,6 +95,4 @@ def test_a_changed_unit_is_computed_alone(tmp_path: Path, monkeypatch: pytest.Mo
     lot = {"overrides": ["combine=lot"]}
     assert {stage for stage, _ in run(**lot)} == {"report", "summary", "prior"}
     change_recording(campaign)
-    assert run(compared=True, **lot) == {
-        (stage, FIRST) for stage in (*of_unit, "prior")
-    }  # no prior of three
+    assert run(compared=True, **lot) == {(stage, FIRST) for stage in (*of_unit, "prior")}  # no prior of three
