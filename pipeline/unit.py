@@ -29,6 +29,7 @@ class Step(NamedTuple):
     returns: str  # attribute of ``UnitState`` that it returns; of ``fits``, the entry of one sensor
 
 
+EFFECTS_STAGE = "effects"  # of a fit, after the stages of its method
 DOCUMENTS = ("calibration", "validation", "diagnosis")
 BENCH_SECTIONS = ("sensor", "table", "procedure")
 STEPS = {  # in the order of a run

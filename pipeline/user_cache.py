@@ -20,7 +20,6 @@ from typing import Any
 
 from pipeline.files import state_of_files, write_atomically
 
-PACKAGE = Path(__file__).resolve().parent
 FOLDERS = {"darwin": "~/Library/Caches", "win32": "~/AppData/Local"}  # by platform; others: XDG base directories
 DIGEST_SIZE = 64  # hexadecimal digits of SHA-256
 
@@ -65,4 +64,4 @@ def _digest(state: str, content: bytes) -> bytes:
 @cache
 def _program() -> str:
     """Return a digest of the interpreter, and of the names, sizes and times of the package's modules."""
-    return f"{MAGIC_NUMBER.hex()} {state_of_files(PACKAGE.rglob('*.py'))}"
+    return f"{MAGIC_NUMBER.hex()} {state_of_files(Path(__file__).resolve().parent.rglob('*.py'))}"

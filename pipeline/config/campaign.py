@@ -36,12 +36,13 @@ from pydantic import ValidationError
 from pipeline.config.compose import Composer
 from pipeline.config.layers import as_list, load_layers
 from pipeline.config.options import GROUPS, RUN_SETTINGS, Problem, mapping_of, nearest, parse
-from pipeline.config.stage_settings import EFFECTS_STAGE, last_stage
+from pipeline.config.stage_settings import last_stage
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError, first
 from pipeline.files import CONFIGS, JSON, SHIPPED, canonical_json
 from pipeline.history import SENSORS
 from pipeline.settings import RunSettings
+from pipeline.unit import EFFECTS_STAGE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

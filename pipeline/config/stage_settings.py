@@ -19,7 +19,7 @@ from pipeline.files import CONFIGS, canonical_json
 from pipeline.history import SENSORS, digest
 from pipeline.io.files import state_of_recordings
 from pipeline.settings import OF_BENCH, Board, Settings, Stated, Unit
-from pipeline.unit import STEPS
+from pipeline.unit import EFFECTS_STAGE, STEPS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 PACKAGE = Path(__file__).resolve().parents[1]
 PACKAGES = ("pipeline", "imu_logs")  # beside each other, in a clone and in a wheel
-EFFECTS_STAGE = "effects"  # of a fit
 CAMPAIGN = "campaign"  # cannot be a batch, because their names end in a number
 EFFECTS_FOLDER = CONFIGS / "effect"  # read by pipeline.model.effects
 # An import of the package, or of jinja2: module and names, or only a module. ``ast`` takes 0.5 s for all files.

@@ -27,13 +27,13 @@ from pipeline.pack import FAILED, INCOMPLETE, Files, Pack, as_bytes, new_pack
 from pipeline.results_folder import hold_as_job, record_written, repetitions
 from pipeline.settings import Settings, UserEffectFiles
 from pipeline.stages import MODULES
-from pipeline.unit import STEPS, Task, run_step
+from pipeline.unit import EFFECTS_STAGE, STEPS, Task, run_step
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from types import ModuleType
 
-FITS, EFFECTS_STAGE = ("accelerometer", "gyroscope"), "effects"
+FITS = ("accelerometer", "gyroscope")
 INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "collect": (),
     "ingest": (),
