@@ -20,10 +20,23 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 __all__ = [
-    "UNKNOWN_LAYOUT", "CannotCalibrateError", "ConfigurationError", "ConvergenceError", "DamagedFileError",
-    "IngestError", "InputError", "InternalError", "MissingInputError", "NotObservableError", "PipelineError",
-    "as_published", "failure_of", "first", "is_of_run", "omission",
-]  # fmt: skip
+    "UNKNOWN_LAYOUT",
+    "CannotCalibrateError",
+    "ConfigurationError",
+    "ConvergenceError",
+    "DamagedFileError",
+    "IngestError",
+    "InputError",
+    "InternalError",
+    "MissingInputError",
+    "NotObservableError",
+    "PipelineError",
+    "as_published",
+    "failure_of",
+    "is_of_run",
+    "omission",
+    "shortened",
+]
 
 
 class DamagedFileError(InputError):
@@ -93,6 +106,6 @@ def is_of_run(error: Exception) -> bool:
     return isinstance(error, OSError) and error.filename is None
 
 
-def first(names: Sequence[str], most: int, of: str = "") -> list[str]:
+def shortened(names: Sequence[str], most: int, of: str = "") -> list[str]:
     """Return the first ``most`` names or lines; one last entry states the number of the others."""
     return [*names[:most], *([f"and {len(names) - most} more {of}".rstrip()] if len(names) > most else [])]

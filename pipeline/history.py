@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import InputError, first
+from pipeline.errors import InputError, shortened
 from pipeline.files import JSON, write_json
 
 if TYPE_CHECKING:
@@ -221,7 +221,7 @@ def difference(before: JSON, after: JSON) -> StateChange:
 
 
 def _named(what: str, names: Sequence[str]) -> str:
-    return f"{what}: {', '.join(first(names, NAMED_CHANGES))}" if names else what
+    return f"{what}: {', '.join(shortened(names, NAMED_CHANGES))}" if names else what
 
 
 def _changed_recordings(before: JSON, after: JSON) -> list[str]:

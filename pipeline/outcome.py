@@ -14,7 +14,7 @@ import shlex
 from collections import Counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipeline.errors import first
+from pipeline.errors import shortened
 from pipeline.files import INSTALLED, JSON, read_json, text_of_cell
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
 from pipeline.verdicts import FAILED, KINDS, READY, SETTING, WITH_THEM, Verdict, problems, state_of
@@ -131,7 +131,7 @@ def place(verdict: str | None) -> int:
 
 def lines_of(groups: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     """Return a line for each group of units; it names the first units of a large group."""
-    return [f"{what}: {', '.join(first(units, NAMED_PER_LINE))}" for what, units in groups]
+    return [f"{what}: {', '.join(shortened(units, NAMED_PER_LINE))}" for what, units in groups]
 
 
 def commands_of(
@@ -180,7 +180,7 @@ def explain_command(settings: Mapping[str, Any], words: Sequence[str], results: 
 
 def problem_words(problem: Problem, most: int = NAMED_PER_LINE) -> str:
     """Return a problem in one sentence: kind, units, sensors or effects, and how far the error is above the noise."""
-    units = f"{len(problem.units)} units: " * (len(problem.units) > 1) + ", ".join(first(problem.units, most))
+    units = f"{len(problem.units)} units: " * (len(problem.units) > 1) + ", ".join(shortened(problem.units, most))
     return "; ".join(filter(None, [f"{KINDS[problem.kind].name}: {units}", problem.what, ratio_words(problem)]))
 
 
@@ -203,18 +203,18 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     lines += lines_of(beyond_limits_groups(rows))
     lines += lines_of(_not_in_uncertainty(rows).items())
     for column, words in (("left_out", "left out"), ("incomplete", "not complete")):
-        lines += first(
+        lines += shortened(
             [f"{r['unit']}, {words}: {what}" for r in rows if (what := r.get(column))], NAMED_PER_LINE, "units"
         )
     entries = read_history(results) if of_this_run else []
     if entries:
-        lines += first(_changes(entries), NAMED_PER_LINE, "sensors that changed")
+        lines += shortened(_changes(entries), NAMED_PER_LINE, "sensors that changed")
         no_longer = [
             f"{unit}: this run no longer has {', '.join(effects)}, which run {run} had; to have it in every run:\n"
             f"  {add_command(settings, unit, effects, folder)}"
             for (unit, run), effects in dropped(entries).items()
         ]
-        lines += first(no_longer, NAMED_PER_LINE, "units that no longer have an effect")
+        lines += shortened(no_longer, NAMED_PER_LINE, "units that no longer have an effect")
     found = problems(rows)
     for problem in found:
         if problem.kind not in (FAILED, Verdict.MISSING_EFFECT):
@@ -257,7 +257,9 @@ def _reasons(results: Path, units: Sequence[str]) -> list[str]:
                 groups = kinds.setdefault(kind, {})
                 if doubt:
                     groups.setdefault(f"{sensor}, {doubt}", []).append(unit)
-    return [line for groups in kinds.values() for line in first(lines_of(groups.items()), NAMED_PER_LINE, "reasons")]
+    return [
+        line for groups in kinds.values() for line in shortened(lines_of(groups.items()), NAMED_PER_LINE, "reasons")
+    ]
 
 
 def _not_in_uncertainty(rows: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:

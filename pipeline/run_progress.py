@@ -32,7 +32,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from pipeline.errors import first
+from pipeline.errors import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -317,7 +317,7 @@ class Monitor(logging.Handler):
         if edited:
             lines = [
                 "Changed or deleted since the last run, computed again:",
-                *(f"  {line}" for line in first(edited, NAMED_UNITS_OF_RUN)),
+                *(f"  {line}" for line in shortened(edited, NAMED_UNITS_OF_RUN)),
             ]
             print("\n".join(lines), file=self.stream, flush=True)
 
@@ -343,7 +343,7 @@ class Monitor(logging.Handler):
             count = f"{len(self.failed)} job{'s' * (len(self.failed) > 1)}"
             lines += [f"\n{count} failed; incomplete output is removed, all other jobs are done:"]
             causes = [f"{rule}: {_cause(log)} (all of it: {log})" for rule, log in self.failed]
-            lines += [f"  {line}" for line in first(causes, NAMED_UNITS_OF_RUN)]
+            lines += [f"  {line}" for line in shortened(causes, NAMED_UNITS_OF_RUN)]
             lines += ["Correct the cause, then run the same command again:", f"  {command}"]
         if lines:
             print("\n".join(lines), file=self.stream)

@@ -15,7 +15,7 @@ from pipeline.commands.run import run_snakemake
 from pipeline.config.campaign import TAKE_OVER, find_campaign, read_layers
 from pipeline.config.devices import edit_effects, sensor_and_effect
 from pipeline.config.owner import require_own_results
-from pipeline.errors import ConfigurationError, MissingInputError, PipelineError, first
+from pipeline.errors import ConfigurationError, MissingInputError, PipelineError, shortened
 from pipeline.files import write_atomically
 from pipeline.model.effects import catalogue
 from pipeline.outcome import DEFAULT_RESULTS, NAMED_PER_LINE, changes_of, read_summary, run_command
@@ -135,7 +135,7 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
     own = changes_of(results, list(effects_of)) if code == 0 else []
     print(
         "\n".join(
-            first(own, NAMED_PER_LINE, "sensors that changed")
+            shortened(own, NAMED_PER_LINE, "sensors that changed")
             or ["no sensor of these units has another error"] * (code == 0)
         )
     )

@@ -19,7 +19,7 @@ from pipeline.commands import parser_of
 from pipeline.commands.readings import Reading, campaign_of, config_of_log, grouped, recordings_of_files
 from pipeline.config.campaign import find_campaign, load_campaign
 from pipeline.config.options import nearest
-from pipeline.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, first
+from pipeline.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, shortened
 from pipeline.files import write_atomically
 from pipeline.io.files import FILE, recording_files
 from pipeline.model.calibration_file import LEFT_OUT_REASONS
@@ -174,12 +174,12 @@ def _print_mountings(groups: Sequence[FoundMounting], units: int | None) -> None
         place = "campaign.yaml" if len(group.units) == units else of_units
         text = (
             f"MOUNTING: gravity shows another one than stated in {', '.join(group.recordings)} of "
-            f"{', '.join(first(group.units, NAMED_PER_LINE, 'units'))}, and it is used as found (N-FOUND). If the "
+            f"{', '.join(shortened(group.units, NAMED_PER_LINE, 'units'))}, and it is used as found (N-FOUND). If the "
             f"bench is so, state it in {place}; else correct the columns or the mounting (docs/mounting.md):"
         )
         print(_wrapped(text) + f"\n\n{as_overrides(group.ways)}")
     if others := [unit for group in groups[MOST_IN_FULL:] for unit in group.units]:
-        units_named = ", ".join(first(others, NAMED_PER_LINE, "units"))
+        units_named = ", ".join(shortened(others, NAMED_PER_LINE, "units"))
         print(_wrapped(f"MOUNTING: other settings describe {units_named}: check each with --unit") + "\n")
 
 
@@ -304,9 +304,9 @@ def _print_saved(saved: Mapping[Path, Sequence[str]]) -> None:
     """Print how a run uses the saved profiles that read what is refused; ``saved``: profile to the units or logs."""
     for file, names in saved.items():
         text = (
-            f"SAVED PROFILE: {file} describes the files of {', '.join(first(names, NAMED_PER_LINE))}. A run uses it "
-            f"where the settings name it: write {file.stem} into the column ingest of units.csv, or for all units into "
-            "campaign.yaml:"
+            f"SAVED PROFILE: {file} describes the files of {', '.join(shortened(names, NAMED_PER_LINE))}. A run uses "
+            f"it where the settings name it: write {file.stem} into the column ingest of units.csv, or for all units "
+            "into campaign.yaml:"
         )
         print(_wrapped(text) + f"\n\n{as_overrides([[f'ingest={file.stem}']])}")
 

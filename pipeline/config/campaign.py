@@ -38,7 +38,7 @@ from pipeline.config.layers import as_list, load_layers
 from pipeline.config.options import GROUPS, RUN_SETTINGS, Problem, mapping_of, nearest, parse
 from pipeline.config.stage_settings import last_stage
 from pipeline.config.user_effects import PYTHON
-from pipeline.errors import ConfigurationError, first
+from pipeline.errors import ConfigurationError, shortened
 from pipeline.files import CONFIGS, JSON, SHIPPED, canonical_json
 from pipeline.history import SENSORS
 from pipeline.settings import RunSettings
@@ -152,7 +152,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
             for line in str(problem).splitlines():
                 problems.setdefault(line, []).append(name)
     if problems:
-        lines = [f"  unit {', '.join(first(names, 5))}: {text}" for text, names in problems.items()]
+        lines = [f"  unit {', '.join(shortened(names, 5))}: {text}" for text, names in problems.items()]
         raise ConfigurationError("the configuration is refused:\n" + "\n".join(lines), str(directory / "units.csv"))
     of_run = run_settings(layers.of_run)
     batches, chains = cut_batches(units, None if of_run.batch_size == "auto" else of_run.batch_size)
@@ -160,7 +160,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     split = [board for board, chips in boards_of(units).items() if len({batch_of[chip] for chip in chips}) > 1]
     if split:
         raise ConfigurationError(
-            f"column board: the chips of {', '.join(first(split, 5))} are estimated together; "
+            f"column board: the chips of {', '.join(shortened(split, 5))} are estimated together; "
             "expected consecutive rows with the same method",
             str(directory / "units.csv"),
         )

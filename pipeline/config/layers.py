@@ -35,7 +35,7 @@ from imu_logs.files import not_regular, read_text
 from imu_logs.yaml_file import read_yaml
 from pipeline.config.options import GROUPS, RUN_SETTINGS, Problem, default_option, nearest, parse
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
-from pipeline.errors import ConfigurationError, first
+from pipeline.errors import ConfigurationError, shortened
 from pipeline.io.files import wrong_name
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def read_units_table(path: Path) -> UnitsTable:
     if not units and not problems:
         problems.append("has no units")
     if problems:
-        raise ConfigurationError("; ".join(first(problems, 20)), str(path))
+        raise ConfigurationError("; ".join(shortened(problems, 20)), str(path))
     return UnitsTable(units, lines)
 
 
@@ -304,7 +304,7 @@ def _read_devices(directory: Path, units_table: UnitsTable) -> dict[str, list[st
         if run:
             problems.append(f"{file}: {run[0]}: is a setting of the run, not of a device; set it in campaign.yaml")
     if problems:
-        raise ConfigurationError("the configuration is refused:\n  " + "\n  ".join(first(problems, 5, "files")))
+        raise ConfigurationError("the configuration is refused:\n  " + "\n  ".join(shortened(problems, 5, "files")))
     return devices
 
 

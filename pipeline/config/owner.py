@@ -19,7 +19,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.config.campaign import load_campaign
-from pipeline.errors import PipelineError, first
+from pipeline.errors import PipelineError, shortened
 from pipeline.files import read_json
 from pipeline.io.digests import digests_in_pack, digests_of_entries, digests_of_files
 from pipeline.pack import Pack, read_published
@@ -116,7 +116,7 @@ def _digests(campaign: Campaign, unit: str) -> list[str]:
 
 def _refusal(campaign: Campaign, reason: str) -> OtherCampaignError:
     results, owner = campaign.results, read_owner(campaign.results)
-    places = ", ".join(first(sorted(recorded_directories(results)), 3))
+    places = ", ".join(shortened(sorted(recorded_directories(results)), 3))
     known = f"the campaign {owner.campaign}" if owner else f"another campaign ({places or 'of unknown folder'})"
     message = f"other_campaign: holds the results of {known}; this campaign is {campaign.directory}, and {reason}"
     message += ". Write its results to another folder: results=DIR (--results DIR)"

@@ -36,7 +36,7 @@ from pipeline.estimation.design import (
 )
 from pipeline.estimation.engine import MIN_EIGENVALUE_SHARE, ErrorMixture, ResidualNoise, noise_outside_known_errors
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, selection_grid
-from pipeline.estimation.least_squares import certified
+from pipeline.estimation.least_squares import convergence_evidence
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.observations import Observations, observe, weighted
@@ -391,7 +391,7 @@ def calibration_of(
         stages=(*(before.stages if before else ()), stage),
         effects=effects,
         converged=fit.converged,
-        convergence=certified(fit.cosine, fit.condition, fit.rank, len(covariance)),
+        convergence=convergence_evidence(fit.cosine, fit.condition, fit.rank, len(covariance)),
     )
     if settings is None:
         return combined(found, [scatter_contribution(covariance, fit.degrees_of_freedom)], {})

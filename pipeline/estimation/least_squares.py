@@ -158,8 +158,8 @@ def gauss_newton(  # noqa: PLR0917  (what an iteration is)
     return state, (r, J), iterations
 
 
-def certificate(A: Values, residual: Values, condition: float, rank: int) -> dict[str, Any]:
-    """Return the certificate that a linear estimate is a minimum, for ``SensorCalibration.convergence``.
+def linear_convergence_evidence(A: Values, residual: Values, condition: float, rank: int) -> dict[str, Any]:
+    """Return the evidence that a linear estimate is a minimum, for ``SensorCalibration.convergence``.
 
     ``A``: (n, p), columns, the same for each channel. ``residual``: (n,) or (n, m), of m channels. ``condition``: of
     the scaled columns.
@@ -167,11 +167,11 @@ def certificate(A: Values, residual: Values, condition: float, rank: int) -> dic
     products = np.abs(A.T @ residual)
     size = np.multiply.outer(np.linalg.norm(A, axis=0), np.linalg.norm(residual, axis=0))
     cosine = np.divide(products, size, out=np.zeros_like(products), where=size > 0.0)
-    return certified(float(cosine.max()), condition, rank, A.shape[1])
+    return convergence_evidence(float(cosine.max()), condition, rank, A.shape[1])
 
 
-def certified(cosine: float, condition: float, rank: int, parameters: int) -> dict[str, Any]:
-    """Return the certificate of a fit, for ``SensorCalibration.convergence``."""
+def convergence_evidence(cosine: float, condition: float, rank: int, parameters: int) -> dict[str, Any]:
+    """Return the evidence that a fit is at its minimum, for ``SensorCalibration.convergence``."""
     return {
         "cosine": cosine,
         "cosine_at_minimum": COSINE_AT_MINIMUM,

@@ -33,7 +33,7 @@ from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.candidates import bench_effects
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.generalized_least_squares import fit_joint
-from pipeline.estimation.least_squares import ScaledColumns, certificate
+from pipeline.estimation.least_squares import ScaledColumns, linear_convergence_evidence
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.stages import FitStage
@@ -104,7 +104,7 @@ def fit(
         bias=bias,
         matrix=matrix,
         stages=(*(previous.stages if previous else ()), result),
-        convergence=certificate(X, residuals, condition, rank),
+        convergence=linear_convergence_evidence(X, residuals, condition, rank),
     )
 
     def results(errors: Values) -> Values:

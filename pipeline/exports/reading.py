@@ -23,7 +23,7 @@ import numpy as np
 from jinja2 import TemplateError
 
 from imu_logs.files import read_text
-from pipeline.errors import ConfigurationError, InputError, MissingInputError, first
+from pipeline.errors import ConfigurationError, InputError, MissingInputError, shortened
 from pipeline.exports import formats
 from pipeline.exports.sensors import TEMPLATE_FUNCTIONS, UNIT_FACTORS
 from pipeline.exports.text_kinds import Expressions, Node, parsed
@@ -228,7 +228,7 @@ def _read(
              if content.has(path) and content.at(path) is not None}  # fmt: skip
     unread = content.unread()
     if unread:
-        notes.append(f"not read: {', '.join(first(unread, 12))}")
+        notes.append(f"not read: {', '.join(shortened(unread, 12))}")
     notes += [f"{s}: the file states no bias; it counts as 0" for s, c in calibrations.items() if not np.any(c.bias)]
     return ImportedCalibration(format_name, file.stem, calibrations, noise, notes)
 

@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from imu_logs.files import not_regular
-from pipeline.errors import ConfigurationError, InputError, MissingInputError, first
+from pipeline.errors import ConfigurationError, InputError, MissingInputError, shortened
 from pipeline.model.checked import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import parameter_limits
@@ -316,7 +316,7 @@ def beyond_limits(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -
 def beyond_words(part: Mapping[str, Any] | None) -> str:
     """Return the entries of ``beyond_limits`` in a calibration in words: ``bias y (250 %), ...``; empty for none."""
     entries = (part or {}).get("beyond_limits") or []
-    return ", ".join(first([f"{_plain(e)} ({100.0 * e['ratio']:.3g} %)" for e in entries], NAMED_PARAMETERS))
+    return ", ".join(shortened([f"{_plain(e)} ({100.0 * e['ratio']:.3g} %)" for e in entries], NAMED_PARAMETERS))
 
 
 def _entry(row: LimitRow) -> Entry:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import first
+from pipeline.errors import shortened
 from pipeline.model.effects import effect
 from pipeline.records import BASE, BASE_NAMES, base_values, matrix_of
 from pipeline.verdicts import WITH_THEM
@@ -119,5 +119,5 @@ def open_words(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
         U, wide = np.max([pair for name, pair in both.items() if name.startswith(kind)] or [(0.0, 0.0)], axis=0)
         figures += [f"{wide:.2g}{unit} of {kind} (without {U:.2g})"] if wide else []
     names = [entry["effect"].replace("_", " ").replace(".", ": ") for entry in part["open"]]
-    source = f"{', '.join(first(names, NAMED_EFFECTS))}{WITH_THEM}{', '.join(figures)}"
+    source = f"{', '.join(shortened(names, NAMED_EFFECTS))}{WITH_THEM}{', '.join(figures)}"
     return [(source, "these recordings leave them open, and U is valid if they are absent")]

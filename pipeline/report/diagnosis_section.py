@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.errors import first
+from pipeline.errors import shortened
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW, min_delta_bic
 from pipeline.estimation.posterior import prior_limit
 from pipeline.model.effects import catalogue
@@ -123,7 +123,7 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
         slow=MIN_DELTA_BIC_OF_SLOW,
         brackets=brackets,
         others=len(entries) - len(shown),
-        hidden=first([plain(h["effect"]) for h in hidden], MOST_HIDDEN),
+        hidden=shortened([plain(h["effect"]) for h in hidden], MOST_HIDDEN),
     )
     figure = Figure(f"{sensor}-ranking", finding, caption)
     label = "ΔBIC (linear to ±10, logarithmic beyond)"

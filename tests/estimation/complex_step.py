@@ -11,8 +11,8 @@ from pipeline.estimation.least_squares import (
     COSINE_AT_MINIMUM,
     STEP_AT_MINIMUM,
     ScaledColumns,
-    certificate,
     gauss_newton,
+    linear_convergence_evidence,
 )
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Solved:
     @property
     def cosine(self) -> float:
         """Largest cosine between the residual and a column."""
-        return float(certificate(self.columns, self.residual, 1.0, len(self.x))["cosine"])
+        return float(linear_convergence_evidence(self.columns, self.residual, 1.0, len(self.x))["cosine"])
 
     @property
     def converged(self) -> bool:

@@ -33,7 +33,7 @@ from pipeline.estimation.accelerometer.turn_extremes import (
     Extremes,
     Sinusoid,
     by_turn,
-    certificate_of,
+    convergence_of_sinusoids,
     extremes_of_samples,
     extremes_of_sinusoids,
     sinusoids_of,
@@ -325,7 +325,7 @@ def fit(
         matrix=np.diag(1.0 / found.k),
         stages=(*(previous.stages if previous else ()), result),
         effects=(FittedEffect(ASYMMETRY, asymmetry),) if last else (),
-        convergence=certificate_of(sinusoids),
+        convergence=convergence_of_sinusoids(sinusoids),
     )
     kept = slice(0, after_c) if last else BASE
     if estimator.as_printed:

@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.least_squares import ScaledColumns, certificate, certified
+from pipeline.estimation.least_squares import ScaledColumns, convergence_evidence, linear_convergence_evidence
 from pipeline.estimation.turns import TurnPart, filtered_alike
 from pipeline.records import AXES, CorrectionStep, Mask, TwoSided, Values
 
@@ -247,10 +247,10 @@ def by_turn(sinusoids: Sequence[Sequence[Sinusoid]], values: Values) -> list[lis
     return [pieces[turn :: len(sinusoids)] for turn in range(len(sinusoids))]
 
 
-def certificate_of(sinusoids: Sequence[Sequence[Sinusoid]]) -> dict[str, Any]:
+def convergence_of_sinusoids(sinusoids: Sequence[Sequence[Sinusoid]]) -> dict[str, Any]:
     """Return the certificate of the sinusoids' fits: the largest cosine and condition of all."""
     fits = [s for turn in sinusoids for s in turn]
-    parts = [certificate(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in fits]
+    parts = [linear_convergence_evidence(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in fits]
     cosine, condition = (max(part[key] for part in parts) for key in ("cosine", "condition"))
     count = sum(part["parameters"] for part in parts)
-    return certified(cosine, condition, count, count)
+    return convergence_evidence(cosine, condition, count, count)

@@ -38,7 +38,7 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, derivative
-from pipeline.estimation.least_squares import ScaledColumns, certificate
+from pipeline.estimation.least_squares import ScaledColumns, linear_convergence_evidence
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.multi_position.moves import trapezoids
 from pipeline.estimation.noise import wander_prior
@@ -155,7 +155,7 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
         bias=previous.bias,
         matrix=matrix,
         stages=(*previous.stages, result),
-        convergence=certificate(U, Y - U @ A.T, columns.condition, columns.rank),
+        convergence=linear_convergence_evidence(U, Y - U @ A.T, columns.condition, columns.rank),
     )
     lines = [scatter.of(BASE)]
     if np.any(of_bias):

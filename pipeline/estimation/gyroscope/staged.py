@@ -28,7 +28,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.engine import LinearMap, derivative
-from pipeline.estimation.least_squares import ScaledColumns, certified
+from pipeline.estimation.least_squares import ScaledColumns, convergence_evidence
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.stages import FitStage, staged_result
 from pipeline.estimation.table_errors import Reference
@@ -215,7 +215,7 @@ def fit(
         bias=offset,
         matrix=matrix,
         stages=(*(previous.stages if previous else ()), result),
-        convergence=certified(0.0, condition, columns, columns) | {"closed_form": True},
+        convergence=convergence_evidence(0.0, condition, columns, columns) | {"closed_form": True},
     )
 
     def results(errors: Values) -> Values:

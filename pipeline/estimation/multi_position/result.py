@@ -18,7 +18,7 @@ import scipy
 
 from pipeline.estimation.at_limits import changes_by_hand, changes_through_gravity, gain_of
 from pipeline.estimation.engine import draw_normal, scaled_inverse
-from pipeline.estimation.least_squares import certified
+from pipeline.estimation.least_squares import convergence_evidence
 from pipeline.estimation.monte_carlo import quadratic_results, with_trials
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
@@ -92,7 +92,7 @@ def with_stage(before: SensorCalibration, stage: StageResult, model: Model, fitt
         matrix=fitted.state.matrix,
         stages=(*before.stages, replace(stage, residual_rms=rms)),
         converged=fitted.converged,
-        convergence=certified(fitted.cosine, fitted.condition, rank, len(fitted.covariance)),
+        convergence=convergence_evidence(fitted.cosine, fitted.condition, rank, len(fitted.covariance)),
     )
 
 
