@@ -65,6 +65,7 @@ def main(argv: Sequence[str]) -> int:
     result = compensate_log(
         compensation, log, arguments.output, profile,
         joined=joined, topic=arguments.topic, smoothing=arguments.smoothing, rest=arguments.rest,
+        strict=arguments.strict,
         progress=lambda rows, read: countdown(read, f"{rows} samples"),
     )  # fmt: skip
     countdown.end()
@@ -95,6 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--topic", metavar="TOPIC", help=words)
     words = "time constant of the causal smoothing of the temperature, s; 0: none (default: %(default)g)"
     add("--temperature-smoothing", type=float, default=SMOOTHING_S, metavar="S", dest="smoothing", help=words)
+    add("--strict", action="store_true", help="refuse a log with samples beyond the temperatures of the soaks")
     words = "interval with a rest, s from the first sample: the gyroscope's bias is measured there"
     add("--rest", type=_seconds, metavar="FROM:TO", help=words)
     words = "file of a Python effect that the calibration uses; the file is run; may be repeated"

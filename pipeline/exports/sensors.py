@@ -364,7 +364,8 @@ def sampling_rate(document: dict[str, Any]) -> float:
 
 def temperatures(document: Mapping[str, Any]) -> list[float]:
     """Return the range of temperatures of a calibration's recordings, degC; if it is not known, ``TEMPERATURES``."""
-    return (document.get("calibrated_range") or {}).get("temperature_degc") or TEMPERATURES
+    known = document.get("calibrated_range") or {}
+    return known.get("soaked_degc") or known.get("temperature_degc") or TEMPERATURES
 
 
 def plain(content: Any) -> Any:  # noqa: ANN401

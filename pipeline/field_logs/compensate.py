@@ -52,6 +52,7 @@ def compensate_log(
     topic: str | None = None,
     smoothing: float = SMOOTHING_S,
     rest: tuple[float, float] | None = None,
+    strict: bool = False,
     block_bytes: int = BLOCK_BYTES,
     progress: Callable[[int, int], None] | None = None,
 ) -> Result:
@@ -61,7 +62,8 @@ def compensate_log(
     order of a profile that joins several. ``topic``: of the calibrated messages in an MCAP log; by default, topic of
     the readings with the suffix ``_calibrated``. ``smoothing``: memory of the regression line through past
     temperatures, s; 0 uses the temperature unchanged. ``rest``: an interval with a rest, s from the first sample; its
-    mean rate is subtracted from the gyroscope. ``progress`` is called with the numbers of finished samples and of read
+    mean rate is subtracted from the gyroscope. ``strict``: whether to refuse samples beyond the soaked temperatures.
+    ``progress`` is called with the numbers of finished samples and of read
     bytes. Raises ``InputError``, without an output, if the log is damaged, contradicts the profile, has no rest in the
     interval ``rest``, or would be overwritten.
     """
@@ -72,18 +74,24 @@ def compensate_log(
 
     def write(stream: LogStream, file: Path) -> Result:
         with replacing(file) as out:
-            if suffix == ".mcap":
-                from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (only for this format)
+            result = written(stream, out)
+            if strict:
+                stream.checks.require_within(str(source))
+            return result
 
-                return McapLog(source, out, profile, stream, topic, smoothing).compensate()
-            from pipeline.field_logs.text_output import CsvLog, compensate_whole, sensor_parts  # noqa: PLC0415
+    def written(stream: LogStream, out: Output) -> Result:
+        if suffix == ".mcap":
+            from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (only for this format)
 
-            wanted = len(sensor_parts(profile.ingest, messages=suffix in MESSAGE_FORMATS))
-            if len(files) != wanted:
-                raise InputError(f"the profile reads a recording from {wanted} files; got {len(files)}", str(source))
-            if len(files) > 1 or suffix in MESSAGE_FORMATS:
-                return compensate_whole(files, out, profile, stream)
-            return CsvLog(source, out, profile, stream).compensate(block_bytes)
+            return McapLog(source, out, profile, stream, topic, smoothing).compensate()
+        from pipeline.field_logs.text_output import CsvLog, compensate_whole, sensor_parts  # noqa: PLC0415
+
+        wanted = len(sensor_parts(profile.ingest, messages=suffix in MESSAGE_FORMATS))
+        if len(files) != wanted:
+            raise InputError(f"the profile reads a recording from {wanted} files; got {len(files)}", str(source))
+        if len(files) > 1 or suffix in MESSAGE_FORMATS:
+            return compensate_whole(files, out, profile, stream)
+        return CsvLog(source, out, profile, stream).compensate(block_bytes)
 
     notes = []
     if rest is not None:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imu_logs.units import FORCE_UNITS
+from pipeline.errors import InputError
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 
 DECIMALS = 12  # in the output of ``apply``: far below the resolution of sensors, above the rounding of a double
+TEMPERATURE, SOAKED = "temperature_degc", "soaked_degc"  # of ``calibrated_range``
 RANGES = {"accelerometer": "specific_force_g", "gyroscope": "angular_rate_dps"}  # of ``calibrated_range``
 # Margins of the calibrated range, by convention: the sign of the bias of a low-cost sensor, some % of 1 g, differs
 # between directions; the temperature of a room, and of a chip from one power-on to the next, changes by 1 degC.
@@ -75,7 +77,24 @@ class LogChecks:
             for key, limits in (calibrated_range or {}).items()
             for low, high in [limits if isinstance(limits, list) else (-np.inf, limits)]
         }
+        self.soaked = self.ranges.pop(SOAKED, None)  # the temperatures within which a soak determined the bias
+        if self.soaked:
+            self.ranges[TEMPERATURE] = self.soaked
         self.extremes: dict[str, list[float]] = {}  # beyond the range: number of samples, lowest and highest value
+
+    def extrapolated(self, temperature: Values) -> Mask:
+        """Return which samples are beyond the soaked temperatures: (n,) array; none without a soak."""
+        low, high = self.soaked or (-np.inf, np.inf)
+        return np.asarray((temperature < low) | (temperature > high))
+
+    def require_within(self, file: str) -> None:
+        """Raise ``InputError`` if samples are beyond the soaked temperatures."""
+        if self.soaked and TEMPERATURE in self.extremes:
+            count, least, most = self.extremes[TEMPERATURE]
+            message = (
+                f"--strict: {count:.0f} samples at {least:.1f} to {most:.1f} degC are beyond the soaked temperatures"
+            )
+            raise InputError(f"{message}, {self.soaked[0]:.1f} to {self.soaked[1]:.1f} degC", file)
 
     def check_decimals(self, columns: Sequence[pa.Array], decimal: str) -> None:
         """Check whether the readings of a text log have the decimals that ``apply`` writes."""
@@ -118,10 +137,10 @@ class LogChecks:
     def _add_extremes(self, raw: Mapping[str, Values], temperature: Values | None) -> None:
         """Count the samples beyond the calibrated range."""
         values = {RANGES[s]: np.linalg.norm(v, axis=1) for s, v in raw.items()}
-        values |= {} if temperature is None else {"temperature_degc": temperature}
+        values |= {} if temperature is None else {TEMPERATURE: temperature}
         for key in values.keys() & self.ranges.keys():
             low, high = self.ranges[key]
-            margin = MARGIN_DEGC if key == "temperature_degc" else RANGE_MARGIN * high
+            margin = MARGIN_DEGC * (not self.soaked) if key == TEMPERATURE else RANGE_MARGIN * high
             beyond = values[key][(values[key] < low - margin) | (values[key] > high + margin)]
             if len(beyond):
                 count, least, most = self.extremes.get(key, [0, np.inf, -np.inf])
@@ -132,9 +151,9 @@ class LogChecks:
         warnings = []
         for key, (count, least, most) in sorted(self.extremes.items()):
             low, high = self.ranges[key]
-            if key == "temperature_degc":
+            if key == TEMPERATURE:
                 what = f"temperatures from {least:.1f} to {most:.1f} degC, calibrated from {low:.1f} to {high:.1f} degC"
-                todo = "record turns at these temperatures (procedure thermal_ramp)"
+                todo = "soak it there" if self.soaked else "record turns at these temperatures (procedure thermal_ramp)"
             else:
                 sensor = next(s for s, k in RANGES.items() if k == key)
                 if sensor not in calibrated:

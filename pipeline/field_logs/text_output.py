@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from pipeline.records import Integers, Values
     from pipeline.settings import Ingest
 
+EXTRAPOLATED = "extrapolated"  # 1 where a row is beyond the soaked temperatures, else 0
 BLOCK_ROWS = 20_000  # of a message log, like a block of a text log
 SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
 
@@ -51,6 +52,7 @@ class CsvLog:
         self.columns = {c.channel: c for c in self.settings.columns}
         self.places: dict[str, list[int]] = {}  # indices of the columns of each signal
         self.origin = 0.0
+        self.marked = False  # whether a column states which rows are beyond the soaked temperatures
 
     def compensate(self, block_bytes: int) -> Result:
         """Write the log with calibrated readings."""
@@ -71,6 +73,9 @@ class CsvLog:
                     self.stream.checks.check_decimals(readings, self.settings.decimal)
                 calibrated = self.stream.apply(signals, raw.tell(), f"{self.source}:{lines[0]}")
                 self._replace(cells, signals, calibrated)
+                if self.marked:
+                    beyond = self.stream.checks.extrapolated(signals["temperature"])
+                    cells.append(pc.cast(to_arrow(beyond.astype(np.int64)), pa.string()))
                 self.out.write(_lines_of(cells, self.layout.delimiter, quoted=b'"' in body))
                 rows += len(lines)
             if rows == 0:
@@ -104,7 +109,8 @@ class CsvLog:
         for sensor in (s for s in SENSORS if s in self.places):
             for channel, i in zip(TRIADS[sensor], self.places[sensor], strict=True):
                 new[i] = CANONICAL[channel]
-        self.out.write(head.text(new).encode())
+        self.marked = self.stream.checks.soaked is not None and "temperature" in self.places
+        self.out.write(head.text([*new, *[EXTRAPOLATED] * self.marked]).encode())
 
     def _find(self, names: list[str], where: str) -> None:
         """Find the columns of the signals by the names in the header; ``where``: its place, for messages."""
@@ -197,7 +203,8 @@ def compensate_whole(files: Sequence[Path], out: Output, profile: LogProfile, st
     names = ["time", *(c for s in signals for c in TRIADS[s]), *(["temperature"] * ("temperature" in table.values))]
     signals |= {"time": (table.time_ns - origin) / 1e9}
     signals |= {"temperature": table.values["temperature"]} if "temperature" in table.values else {}
-    out.write((",".join(CANONICAL[c] for c in names) + "\n").encode())
+    marked = stream.checks.soaked is not None and "temperature" in signals
+    out.write((",".join([*(CANONICAL[c] for c in names), *[EXTRAPOLATED] * marked]) + "\n").encode())
     for start in range(0, len(table.time_ns), BLOCK_ROWS):
         block = {name: values[start : start + BLOCK_ROWS] for name, values in signals.items()}
         readings = stream.apply(block, 0, str(source), f" (row {start + 1})")
@@ -205,6 +212,7 @@ def compensate_whole(files: Sequence[Path], out: Output, profile: LogProfile, st
         columns += [block["temperature"]] if "temperature" in block else []
         arrays = [times_as_decimals(table.time_ns[start : start + BLOCK_ROWS])]
         arrays += [to_arrow(np.round(v, DECIMALS) + 0.0) for v in columns]
+        arrays += [to_arrow(stream.checks.extrapolated(block["temperature"]).astype(np.int64))] if marked else []
         sink = pa.BufferOutputStream()
         rows = pa.Table.from_arrays(arrays, [str(i) for i in range(len(arrays))])
         csv.write_csv(rows, sink, csv.WriteOptions(include_header=False))

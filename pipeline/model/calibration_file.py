@@ -115,7 +115,8 @@ def _sensor(unit: str) -> Check:
     return fields({**required, **optional}, required, others=True)
 
 
-_RANGE = fields({"specific_force_g": number, "angular_rate_dps": number, "temperature_degc": items(number, 2)}, ())
+_TEMPERATURES = dict.fromkeys(("temperature_degc", "soaked_degc"), items(number, 2))
+_RANGE = fields({"specific_force_g": number, "angular_rate_dps": number, **_TEMPERATURES}, ())
 _DOCUMENT = fields(
     {
         "status": one_of("ok"),

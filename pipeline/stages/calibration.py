@@ -140,17 +140,19 @@ def _chip(job: Job, unit: str) -> Chip:
 def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
     """Return the range of the recordings in the fits: largest magnitude of a reading (g, deg/s), temperatures (degC).
 
-    Magnitudes are of the readings as logged. A quantity that no recording contains is absent.
+    Magnitudes are of the readings as logged. ``soaked_degc``: the temperatures of soaks alone. A quantity that no
+    recording contains is absent.
     """
     found: dict[str, Any] = {}
     for sensor, key in (("accelerometer", "specific_force_g"), ("gyroscope", "angular_rate_dps")):
         own = [r for r in recordings if r.role in {sensor, "rests"} and r.valid.any()]
         sizes = [np.linalg.norm(v[r.valid], axis=1).max() for r in own if (v := r.reading(sensor)) is not None]
         found |= {key: round(float(max(sizes)), 6)} if sizes else {}
-    warmth = [r.temperature for r in recordings if r.role in {*SENSORS, "rests"} and r.temperature is not None]
-    if warmth and sum(map(len, warmth)):
-        known = np.concatenate(warmth)
-        found["temperature_degc"] = [round(float(v), 3) for v in (np.nanmin(known), np.nanmax(known))]
+    warm = [r for r in recordings if r.role in {*SENSORS, "rests"} and r.temperature is not None and r.samples]
+    for key, chosen in (("temperature_degc", warm), ("soaked_degc", [r for r in warm if r.kind == "soak"])):
+        if chosen:
+            known = np.concatenate([np.asarray(r.temperature) for r in chosen])
+            found[key] = [round(float(v), 3) for v in (np.nanmin(known), np.nanmax(known))]
     return found
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,6 +11,9 @@ import pytest
 
 import pipeline
 from pipeline.errors import InputError
+from pipeline.field_logs.compensate import compensate_log
+from pipeline.model.compensation import load
+from pipeline.records import SensorCalibration
 from tests.study.listed_recordings import Unit, at_rest, joined, turned
 
 if TYPE_CHECKING:
@@ -138,3 +143,22 @@ def test_a_soak_shows_bias_over_temperature_to_the_third_power(tmp_path: Path) -
     assert steps[-1]["rms_error"] < 0.01
     assert steps[0]["rms_error"] > 1.0
     assert result.calibration["calibrated_range"]["temperature_degc"] == pytest.approx([-15.0, 65.0], abs=0.5)
+
+
+def test_rows_beyond_the_soaked_temperatures_are_marked_or_refused(tmp_path: Path) -> None:
+    part = SensorCalibration("gyroscope").to_json()
+    known = {"calibrated_range": {"temperature_degc": [-20.0, 80.0], "soaked_degc": [10.0, 40.0]}}
+    document = {"schema_version": 2, "status": "ok", "unit": "U1", "accelerometer": None, "gyroscope": part, **known}
+    calibration, log, out = (tmp_path / name for name in ("U1.json", "log.csv", "out.csv"))
+    calibration.write_text(json.dumps(document))
+    warm = [5.0, 10.0, 25.0, 40.0, 41.0]
+    rows = [f"{k},0.1,0.2,0.3,{t}" for k, t in enumerate(warm)]
+    log.write_text("\n".join(["time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,temperature_degc", *rows]) + "\n")
+    compensation = load(calibration)
+    result = compensate_log(compensation, log, out)
+    written = list(csv.DictReader(out.read_text().splitlines()))
+    assert [row["extrapolated"] for row in written] == ["1", "0", "0", "0", "1"]
+    assert any("2 of 5 samples" in warning for warning in result.warnings)
+    with pytest.raises(InputError, match=r"2 samples at 5\.0 to 41\.0 degC are beyond the soaked"):
+        compensate_log(compensation, log, tmp_path / "refused.csv", strict=True)
+    assert not (tmp_path / "refused.csv").exists()
