@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
-from pipeline.estimation.multi_position.effects import accelerometer_of
+from pipeline.estimation.multi_position.effects import accelerometer_of, frame_error
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import with_limits
 from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, MOVED, model_of
@@ -50,10 +50,13 @@ MAX_KNOWN_ELEMENT_UNCERTAINTY = 0.05
 RECORDING_ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 
-def _limits(data_sheet: DataSheet) -> dict[str, float]:
-    """Return the standard uncertainty of each element of the matrix, uniform within the sensor file's limits."""
-    limit = {True: data_sheet.scale_factor, False: data_sheet.cross_axis}
-    return {name: limit[name in ONE] / float(np.sqrt(3.0)) for name in MATRIX_NAMES}
+def _limits(data_sheet: DataSheet, frame: float) -> dict[str, float]:
+    """Return the standard uncertainty of each element of the matrix, uniform within the sensor file's limits.
+
+    ``frame``: of each angle between the frame of the fit and the case, rad, to which the limits refer.
+    """
+    scale, cross = (limit / np.sqrt(3.0) for limit in (data_sheet.scale_factor, data_sheet.cross_axis))
+    return {name: float(scale if name in ONE else np.hypot(cross, frame)) for name in MATRIX_NAMES}
 
 
 def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings) -> SensorCalibration:
@@ -66,8 +69,9 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     _require_recordings(filtered, procedure)
     accelerometer = accelerometer_of(recordings, settings)
     data_sheet, sheet = settings.sensor.gyroscope, procedure.sheet is not None
-    limits = _limits(data_sheet) if sheet else {}
-    model = model_of(filtered, None, noise, procedure, accelerometer, known_by_limit=limits)
+    frame_deg = frame_error(accelerometer, settings)
+    limits = _limits(data_sheet, np.radians(frame_deg)) if sheet else {}
+    model = model_of(filtered, None, noise, procedure, accelerometer, known_by_limit=limits, frame_deg=frame_deg)
     advice = RECORDING_ADVICE + advice_on_held_out(filtered, procedure)
     if model is None or not (model.moves or model.turns or sheet):
         rests = rests_of("gyroscope", filtered, procedure)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.candidates import AUTO, limits_of, offered
@@ -43,6 +45,16 @@ def accelerometer_of(recordings: UnitRecordings, settings: Settings) -> SensorCa
         ) from lack
 
 
+def frame_error(accelerometer: SensorCalibration | None, settings: Settings) -> float:
+    """Return the standard uncertainty of each angle between the accelerometer's frame and the case, deg.
+
+    Of a sheet: its own axes are the frame, and off the case within the limit of the cross-axis sensitivity.
+    """
+    if accelerometer is None or settings.procedure.sheet is None or is_given("accelerometer", settings.method):
+        return 0.0
+    return float(np.degrees(settings.sensor.accelerometer.cross_axis / np.sqrt(3.0)))
+
+
 def model_of(
     recordings: Sequence[Recording],
     calibration: SensorCalibration,
@@ -59,7 +71,8 @@ def model_of(
         return accelerometer.model_of(recordings, calibration, noise, settings)
     if other is None:
         other = accelerometer_of(with_noises(recordings, settings.sensor, ("accelerometer",)), settings)
-    return gyroscope.model_of(recordings, calibration, noise, settings.procedure, other)
+    frame_deg = frame_error(other, settings)
+    return gyroscope.model_of(recordings, calibration, noise, settings.procedure, other, frame_deg=frame_deg)
 
 
 def fit_effects_by_rests(

@@ -1,7 +1,7 @@
 """Equations of stated faces and turns by hand, in addition to the equations of rests and moves.
 
     face f      E_f^T mean_k(f_k) / G = 0 +- s_f
-    turn k      e_a^T Phi_k = A_k +- s_t
+    turn k      e_a^T Phi_k = A_k +- s_t,   of a sheet |Phi_k| = |A_k| +- s_t
     axis a      E_a^T sum_k sign(A_k) Phi_k / sum_k |A_k| = 0 +- s_a
 
 where
@@ -114,16 +114,23 @@ class TurnsByHand:
     # each (r,), deg; of the equations, and standard uncertainty
     value: Values
     error: Values
+    by_length: bool = False  # whether the angle of a turn is |Phi|, whatever its axis, as a sheet states it
 
     def equations(self, state: State, white: Values) -> EquationBlock:
         """Return the equations; ``white`` (3,) is the noise of a sample."""
-        WM = self.rows @ state.matrix
         motion, v = self._samples(state)
         total, length = np.einsum("ts,tsi->ti", self.weight, v), self.weight.sum(axis=1)
+        rows = self.rows
+        if self.by_length:
+            angle = total @ state.matrix.T
+            along = angle * (np.sign(self.stated) / np.linalg.norm(angle, axis=1))[:, None]
+            number, rows = np.arange(len(along)), rows.copy()
+            rows[number, number] = along
+        WM = rows @ state.matrix
         noise = np.einsum("rtc,c,t->r", WM**2, white**2, np.sum(self.weight**2, axis=1))
         error = np.sqrt(self.error**2 + noise)
         bias = -np.einsum("rtc,t->rc", WM, length)
-        matrix = np.einsum("rti,tj->rij", self.rows, total).reshape(-1, 9)
+        matrix = np.einsum("rti,tj->rij", rows, total).reshape(-1, 9)
 
         def columns(term: EffectColumns) -> Values:
             Z = term.effect.columns("gyroscope", motion, state.K, term.values)
@@ -196,13 +203,21 @@ def turns_of(
     accelerometer: SensorCalibration | None,
     procedure: Procedure,
     role: str = ROLE,
+    *,
+    frame_deg: float = 0.0,
 ) -> TurnsByHand | None:
     """Return the turns of a stated angle; None if there are none.
 
     ``rests``: all rests of the gyroscope. ``role``: of the recordings that may be one turn; empty for none.
+    ``frame_deg``: standard uncertainty of each angle between the frame of the fit and the case, deg.
     """
     chosen = stated_turns(recordings, rests, procedure, role)
-    return _gathered(recordings, chosen, accelerometer, procedure.turns) if chosen and procedure.turns else None
+    if not chosen or procedure.turns is None:
+        return None
+    accuracy = float(np.hypot(procedure.turns.axis_accuracy_deg, frame_deg))
+    turns = procedure.turns.replaced(axis_accuracy_deg=accuracy)
+    found = _gathered(recordings, chosen, accelerometer, turns)
+    return replace(found, by_length=procedure.sheet is not None)
 
 
 def _gathered(

@@ -353,11 +353,12 @@ def model_of(
     *,
     moved: Values | None = None,
     known_by_limit: Mapping[str, float] | None = None,
+    frame_deg: float = 0.0,
 ) -> GyroscopeModel | None:
     """Return the model of the recordings' rests and moves, or None if there is no rest.
 
     ``calibration``: of the gyroscope; its outlying moves are not used. ``moved``: (12,), see ``moves.observed_rests``;
-    by default that of ``calibration``, as is ``known_by_limit``.
+    by default that of ``calibration``, as is ``known_by_limit``. ``frame_deg``: see ``faces_and_turns.turns_of``.
     """
     details = [stage.details for stage in calibration.stages] if calibration else []
     if moved is None:
@@ -369,7 +370,7 @@ def model_of(
         return None
     rests, gravity = observed
     moves = None if accelerometer is None else moves_of(recordings, rests)
-    turns = turns_of(recordings, rests, accelerometer, procedure)
+    turns = turns_of(recordings, rests, accelerometer, procedure, frame_deg=frame_deg)
     if moves is not None and calibration is not None:
         outlying = {(move["recording"], float(move["time_s"])) for d in details for move in d.get("moves_outlying", ())}
         names = [recordings[int(i)].name for i in rests.recording[moves.after]]

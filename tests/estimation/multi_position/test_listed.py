@@ -60,10 +60,10 @@ def test_an_axis_that_is_known_to_a_degree_leaves_the_cross_axis_terms_to_the_se
     with_three_turns(tmp_path)
     result = calibrated(tmp_path)
     by = np.array(result.calibration["gyroscope"]["determined_by"]["matrix"])
-    assert set(np.diag(by)) == {"recordings"}
     assert set(by[~np.eye(3, dtype=bool)]) == {"sensor_file"}
     assert result.verdict["gyroscope"] == "not_enough_data"
     U = np.array(result.calibration["gyroscope"]["expanded_uncertainty"]["matrix"])
+    assert np.all(np.diag(U) < 0.002)  # the turns give the scale, whatever the axes: its limit is 0.03
     limit = 0.02 / np.sqrt(3.0)  # cross_axis of the sensor file
     assert np.all(U[~np.eye(3, dtype=bool)] > 1.5 * limit)
     assert np.all(U[~np.eye(3, dtype=bool)] < 2.5 * limit)
