@@ -97,7 +97,7 @@ def added_variable_of_rests(selection: by_hand.SelectionByHand) -> JSON | None:
     """Return the same for rests by hand; None if the first selected effect shows mostly in the moves."""
     model, fit = selection.model, selection.fits[-1]
     term, block = placed(fit.state.terms, model.directions.shape[1])[selection.names[0]]
-    equations = model.equations(fit.state)
+    equations = fit.equations
     columns = equations.columns
     white, _ = equations.whitened(fit.noise, np.column_stack([columns, equations.residual]))
     scale = solve(equations, fit.noise, *np.zeros((2, columns.shape[1]))).scale

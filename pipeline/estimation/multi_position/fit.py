@@ -326,7 +326,7 @@ def plausible(model: Model, fitted: FitByHand, limits: Limits) -> bool:
 
 def require_observable(model: Model, fitted: FitByHand, limits: Limits) -> None:
     """Raise ``NotObservableError``, with the effects or parameters, if rests and moves do not determine them."""
-    equations = model.equations(fitted.state)
+    equations = fitted.equations
     limited = _prior(model, fitted.state, limits)[0] > 0.0
     names = parameter_names(model.sensor, [term.effect for term in fitted.state.terms])
     Q, _ = np.linalg.qr(equations.base)

@@ -309,7 +309,7 @@ class GyroscopeModel:
 
     def accelerometer_errors(self, fitted: FitByHand) -> Values:
         """Return the estimate of the accelerometer's errors of bias and matrix from the moves: (12,) array."""
-        equations = self.equations(fitted.state)
+        equations = fitted.equations
         shared = np.zeros((len(equations.residual), BASE_COUNT))
         shared[self.of_moves] = self._of_moves(fitted.state).shared
         white, _ = equations.whitened(fitted.noise, np.column_stack([shared, equations.residual]))

@@ -165,7 +165,7 @@ def limits_contribution(model: Model, fitted: FitByHand) -> tuple[list[Contribut
     place = _places(model, fitted)
     if not model.known_by_limit:
         return [], np.zeros((len(place), len(place)))
-    equations = model.equations(fitted.state)
+    equations = fitted.equations
     X = equations.columns
     inverse = np.linalg.inv(equations.covariance(fitted.noise))
     gain = scaled_inverse(X.T @ inverse @ X) @ X.T @ inverse
@@ -179,7 +179,7 @@ def _with_monte_carlo(
     calibration: SensorCalibration, model: Model, fitted: FitByHand, trials: int, direct: Sequence[Contribution]
 ) -> SensorCalibration:
     """Return a calibration whose budget also has a Monte Carlo run; ``direct``: its sources of type B."""
-    equations = model.equations(fitted.state)
+    equations = fitted.equations
     n, p = equations.columns.shape
     prior = np.diag(np.sqrt(fitted.precision))[fitted.precision > 0.0]
     X, H = np.concatenate([equations.columns, prior]), np.zeros((n + len(prior), p, p))

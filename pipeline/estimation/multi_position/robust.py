@@ -27,12 +27,13 @@ ROBUST_ROUNDS, SETTLED_WEIGHT_CHANGE = 6, 0.05  # weights that change by less ar
 
 
 def fit_robustly(
-    model: GyroscopeModel, fit_model: Callable[[GyroscopeModel], FitByHand], recordings: Sequence[Recording]
+    model: GyroscopeModel, fit_model: Callable[..., FitByHand], recordings: Sequence[Recording]
 ) -> tuple[GyroscopeModel, FitByHand, list[dict[str, Any]]]:
     """Fit rests and moves, with weights of Student's t if a move is an outlier.
 
-    ``fit_model``: function that fits a model. Returns model and fit with the variance by the weights, and the outliers:
-    ``recording, time_s, error_deg, over_noise, weight``.
+    ``fit_model``: function that fits a model, from ``start`` and what is ``known`` of it if given (``fit``). Returns
+    model and fit with the variance by the weights, and the outliers: ``recording, time_s, error_deg, over_noise,
+    weight``.
     """
     fitted, moves = fit_model(model), model.moves
     if moves is None:
@@ -48,7 +49,7 @@ def fit_robustly(
             break
         variance = np.where(t > 0.0, (error / np.maximum(t, 1e-12)) ** 2, 0.0)
         model = model.with_excess(variance * (1.0 / weight - 1.0))
-        fitted = fit_model(model)
+        fitted = fit_model(model, start=fitted.state, known=(model.equations(fitted.state), fitted.scores))
         t, error = _over_noise(model, fitted)
     outlying = [
         {
@@ -65,7 +66,7 @@ def fit_robustly(
 
 def _over_noise(model: GyroscopeModel, fitted: FitByHand) -> tuple[Values, Values]:
     """Return t of each move, and its residual, deg."""
-    C = model.equations(fitted.state).covariance(fitted.noise)
+    C = fitted.equations.covariance(fitted.noise)
     error = fitted.error[model.of_moves].reshape(-1, 2)
     r = fitted.residual[model.of_moves].reshape(-1, 2) * error
     variance = np.diag(C)[model.of_moves].reshape(-1, 2) * error**2 - model.excess[:, None]
