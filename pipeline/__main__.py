@@ -72,7 +72,9 @@ def main(argv: list[str] | None = None) -> int:
 def run_command(words: list[str]) -> int:
     """Run a known command in this process."""
     from pipeline.errors import UNKNOWN_LAYOUT, PipelineError  # noqa: PLC0415
+    from pipeline.user_cache import use_cache  # noqa: PLC0415
 
+    use_cache()
     command, *rest = words
     try:
         if command in COMMANDS:

@@ -2,7 +2,8 @@
 
 A value is used while what it follows from is unchanged: the caller's ``state``, the code of the package, and the
 interpreter. Only the user can write the folder (mode 0700), because compiled code is read from it. Without such a
-folder every start computes the values.
+folder every start computes the values. Only commands and runs use it (``use_cache``): a call of the library writes no
+file that its caller did not name.
 """
 
 from __future__ import annotations
@@ -24,6 +25,14 @@ FOLDERS = {"darwin": "~/Library/Caches", "win32": "~/AppData/Local"}  # by platf
 DIGEST_SIZE = 64  # hexadecimal digits of SHA-256
 
 
+_used: list[bool] = []  # not empty in the processes of commands and runs
+
+
+def use_cache() -> None:
+    """Read and keep values in this process, and in those that it forks."""
+    _used[:] = [True]
+
+
 @cache
 def cache_folder() -> Path | None:
     """Return the folder, which is created if there is none; None where it cannot be written, or others can write it."""
@@ -41,7 +50,7 @@ def cache_folder() -> Path | None:
 
 def from_cache(name: str, state: str) -> Any:  # noqa: ANN401  (what ``to_cache`` stored)
     """Return the value of a name that was stored in the same state; None if there is none."""
-    if (folder := cache_folder()) is not None:
+    if _used and (folder := cache_folder()) is not None:
         with suppress(OSError, EOFError, ValueError, TypeError):
             content = (folder / name).read_bytes()
             if content[:DIGEST_SIZE] == _digest(state, content[DIGEST_SIZE:]):
@@ -51,7 +60,7 @@ def from_cache(name: str, state: str) -> Any:  # noqa: ANN401  (what ``to_cache`
 
 def to_cache(name: str, state: str, value: Any) -> None:  # noqa: ANN401  (numbers, texts, lists, dictionaries, code)
     """Store the value of a name, where the folder can be written."""
-    if (folder := cache_folder()) is not None:
+    if _used and (folder := cache_folder()) is not None:
         with suppress(OSError, ValueError):
             content = marshal.dumps(value)
             write_atomically(folder / name, _digest(state, content) + content)

@@ -25,6 +25,7 @@ CONFIG = [sys.executable, "-m", "pipeline", "config", "mpu6050-1"]
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(user_cache, "_used", [True])
     cache_folder.cache_clear()
     yield tmp_path / "cache" / "imu-calibration"
     cache_folder.cache_clear()

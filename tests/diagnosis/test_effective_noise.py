@@ -10,7 +10,7 @@ import pytest
 from unit_settings import settings_of
 
 from pipeline.diagnosis.effective_noise import effective_noise
-from pipeline.records import Noise, Recording, SensorCalibration, SensorDiagnosis
+from pipeline.records import Estimate, Noise, Recording, SensorCalibration, SensorDiagnosis
 from pipeline.verdicts import Verdict
 from tests.published import candidate
 
@@ -68,8 +68,7 @@ def test_an_effect_of_the_diagnosis_has_the_share_of_its_own_error() -> None:
     tilt = np.radians(30.0) * np.sin(0.2 * t)  # about x, so that y and z read gravity by its sine and cosine
     attitude = np.stack([np.cos(tilt / 2), np.sin(tilt / 2), 0.0 * t, 0.0 * t], axis=1)
     rate = np.degrees(np.gradient(tilt, DT))
-    parameters = {f"G_{a}{b}": {"value": 0.0, "unit": "deg/s/g"} for a in "xyz" for b in "xyz"}
-    parameters["G_zy"]["value"] = 0.1
+    parameters = {f"G_{a}{b}": Estimate(0.1 * (a + b == "zy"), "deg/s/g") for a in "xyz" for b in "xyz"}
     force_y = np.sin(tilt)
     reading = 0.005 * np.random.default_rng(2).standard_normal((N, 3))
     reading[:, 0] += rate

@@ -28,6 +28,7 @@ def run_stage(folder: Path, harmed: list[str], absent: list[str], *, as_printed:
     files: dict[str, Any] = {
         "ingest": {"U1.parquet": to_parquet(record(Session(1))[:1])},
         "validate": {"U1.json": validation_document("U1", parts)},
+        "diagnose": {"U1.json": dict.fromkeys(SENSORS)},
     }
     for sensor in SENSORS:
         fit = {"not_calibrated": "no angle is logged"} if sensor in absent else SensorCalibration(sensor).to_json()

@@ -30,7 +30,9 @@ from pipeline.results_folder import finish_publishing, repetitions, replaced_fol
 from pipeline.run_progress import Monitor
 from pipeline.stages.batch import forget_last_outputs
 from pipeline.stages.job_server import COMMAND, start_server
+from pipeline.user_cache import use_cache
 
+use_cache()
 RUNNING = not workflow.is_main_process
 NO_RUN = {"-n", "-np", "-pn", "--dry-run", "--dryrun", "--unlock", "--report"}
 
