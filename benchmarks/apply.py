@@ -25,7 +25,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-from pipeline.records import FittedEffect, SensorCalibration
+from pipeline.core.records import FittedEffect, SensorCalibration
 
 EFFECTS = {
     "linear": {},
@@ -39,7 +39,7 @@ COLUMNS = ["time_s", *(f"accel_{a}_g" for a in "xyz"), *(f"gyro_{a}_dps" for a i
 
 
 def write_calibration(path: Path, effects: dict[str, dict[str, float]]) -> None:
-    from pipeline.model.effects import effect  # noqa: PLC0415
+    from pipeline.physics.effects import effect  # noqa: PLC0415
 
     generator = np.random.default_rng(2)
     document: dict[str, Any] = {"unit": "U1", "sensor": "mpu6050", "status": "ok", "schema_version": 1, "error": None}
@@ -116,8 +116,8 @@ def csv_unchanged(log: Path, out: Path, _calibration: Path) -> int:
 
 
 def csv_applied(log: Path, out: Path, calibration: Path) -> int:
-    from pipeline.field_logs.compensate import compensate_log  # noqa: PLC0415
-    from pipeline.model.compensation import load  # noqa: PLC0415
+    from pipeline.app.field_logs.compensate import compensate_log  # noqa: PLC0415
+    from pipeline.physics.compensation import load  # noqa: PLC0415
 
     return compensate_log(load(calibration), log, out).samples
 
@@ -150,8 +150,8 @@ def mcap_unchanged(log: Path, out: Path, _calibration: Path) -> int:
 
 
 def mcap_applied(log: Path, out: Path, calibration: Path) -> int:
-    from pipeline.field_logs.compensate import compensate_log  # noqa: PLC0415
-    from pipeline.model.compensation import load  # noqa: PLC0415
+    from pipeline.app.field_logs.compensate import compensate_log  # noqa: PLC0415
+    from pipeline.physics.compensation import load  # noqa: PLC0415
 
     return compensate_log(load(calibration), log, out).samples
 
@@ -183,8 +183,8 @@ WAYS: dict[str, Callable[[Path, Path, Path], int]] = {
     "mcap official": mcap_official,
 }
 MODULES = {
-    "csv": ["pyarrow.csv", "pyarrow.compute", "pipeline.field_logs.text_output", "pipeline.model.compensation"],
-    "mcap": ["zstandard", "mcap.writer", "mcap.reader", "pipeline.field_logs.mcap_log", "pipeline.model.compensation"],
+    "csv": ["pyarrow.csv", "pyarrow.compute", "pipeline.app.field_logs.text_output", "pipeline.physics.compensation"],
+    "mcap": ["zstandard", "mcap.writer", "mcap.reader", "pipeline.app.field_logs.mcap_log", "pipeline.physics.compensation"],
 }
 
 
@@ -236,8 +236,8 @@ def in_c(folder: Path, real: str) -> float:
 
 def samples_by_themselves(folder: Path, count: int = 3000) -> None:
     """Time a sample by itself, in an array, and in C."""
-    from pipeline.exports import ExportedUnit, export  # noqa: PLC0415
-    from pipeline.model.compensation import load  # noqa: PLC0415
+    from pipeline.output.exports import ExportedUnit, export  # noqa: PLC0415
+    from pipeline.physics.compensation import load  # noqa: PLC0415
 
     generator = np.random.default_rng(0)
     force, rate = generator.normal(0, 1, (count, 3)), generator.normal(0, 50, (count, 3))

@@ -18,15 +18,15 @@ from unittest.mock import patch
 
 import numpy as np
 
-from pipeline.one_unit import unit_of_recordings
-from pipeline.records import coverage_factor
+from pipeline.app.one_unit import unit_of_recordings
+from pipeline.core.records import coverage_factor
 from pipeline.simulation.campaign import simulate_unit
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "study"))
 from bench_units import drawn
 
 BYPASSED = {
-    "pipeline.preprocessing.checks.check_mounting": lambda recordings, _: list(recordings),
+    "pipeline.checks.checks.check_mounting": lambda recordings, _: list(recordings),
     "pipeline.estimation.candidates.bench_effects": lambda *_: [],
     "pipeline.estimation.reference_least_squares.bench_effects": lambda *_: [],
     "pipeline.estimation.observations._lost_at_stops": lambda *_: np.zeros(1),

@@ -26,16 +26,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from pipeline.model.effects.base import truth
-from pipeline.model.kinematics import reference_motion
-from pipeline.records import SENSORS, NotCalibrated
+from pipeline.physics.effects.base import truth
+from pipeline.physics.kinematics import reference_motion
+from pipeline.core.records import SENSORS, NotCalibrated
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
 from pipeline.unit import run_checked
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording, SensorCalibration
-    from pipeline.settings import Settings
+    from pipeline.core.records import Recording, SensorCalibration
+    from pipeline.core.settings import Settings
 
 COURSE = {
     "step_deg": 15.0,

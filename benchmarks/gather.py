@@ -18,15 +18,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config import load_campaign, settings_of_jobs
-from pipeline.pack import PACKED_STEPS, Pack, new_pack
+from pipeline.app.config import load_campaign, settings_of_jobs
+from pipeline.core.pack import PACKED_STEPS, Pack, new_pack
 
 ROOT = Path(__file__).resolve().parents[1]
 SCATTER_G = 1e-3
 # ``ru_maxrss`` would count the memory of this process, too, from which the other is started.
 TELL = """
 import resource, sys
-from pipeline.stages.batch import main
+from pipeline.app.steps.batch import main
 sys.stderr = open("/dev/null", "w")
 main(sys.argv[1], sys.argv[2:])
 used = resource.getrusage(resource.RUSAGE_SELF)

@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from apply import EFFECTS, in_c, write_calibration
 
-from pipeline.exports import ExportedUnit, export
-from pipeline.field_logs.ros2_node import MessageCalibrator
-from pipeline.model.compensation import load
+from pipeline.output.exports import ExportedUnit, export
+from pipeline.app.field_logs.ros2_node import MessageCalibrator
+from pipeline.physics.compensation import load
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pipeline.model.compensation import CompensationStream
+    from pipeline.physics.compensation import CompensationStream
 
 WARM_UP = 1000
 INTERVAL_NS = 1_000_000  # 1 kHz

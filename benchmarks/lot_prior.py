@@ -29,7 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.report.combined import calibration_with_prior, estimates, priors_of
+from pipeline.output.pages.combined import calibration_with_prior, estimates, priors_of
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
 from pipeline.unit import run_checked

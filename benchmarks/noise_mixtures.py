@@ -27,7 +27,7 @@ from scipy.stats import beta
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_search import CompositionSearch, best_of, count_of
 from pipeline.estimation.noise_terms import STOCHASTIC, solved, spectrum_of
-from pipeline.records import Recording
+from pipeline.core.records import Recording
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

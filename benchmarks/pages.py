@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.config import load_campaign
-from pipeline.one_unit import unit_of_campaign
-from pipeline.records import SENSORS, calibrated
-from pipeline.report import campaign_page
+from pipeline.app.config import load_campaign
+from pipeline.app.one_unit import unit_of_campaign
+from pipeline.core.records import SENSORS, calibrated
+from pipeline.output.pages import campaign_page
 from pipeline.unit import Task, run_step
-from pipeline.validation.attitude import attitude
+from pipeline.evaluation.held_out.attitude import attitude
 
 if TYPE_CHECKING:
     from collections.abc import Callable

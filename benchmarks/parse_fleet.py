@@ -12,7 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from pipeline.config import load_campaign
+from pipeline.app.config import load_campaign
 
 ROOT = Path(__file__).parents[1]
 FILES = ("accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z", "validation")

@@ -37,12 +37,12 @@ from scipy import stats
 from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
-from pipeline.config import load_campaign
-from pipeline.io.read import read_recordings
-from pipeline.one_unit import unit_of_campaign, unit_row
-from pipeline.records import SENSORS
-from pipeline.signal.rests import find_rests
-from pipeline.signal.segments import cut
+from pipeline.app.config import load_campaign
+from pipeline.ingest.read import read_recordings
+from pipeline.app.one_unit import unit_of_campaign, unit_row
+from pipeline.core.records import SENSORS
+from pipeline.physics.signal.rests import find_rests
+from pipeline.physics.signal.segments import cut
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
 from pipeline.unit import run_checked
@@ -50,8 +50,8 @@ from pipeline.unit import run_checked
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pipeline.records import Recording
-    from pipeline.settings import Settings
+    from pipeline.core.records import Recording
+    from pipeline.core.settings import Settings
 
 METHOD = {"accelerometer": ["nonlinear_least_squares"], "gyroscope": ["rests_and_moves"]}
 FEWEST = 250.0  # deg by the raw rate, its bias included: a move that counts as a turn by 360 deg

@@ -18,13 +18,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import scipy.special  # noqa: F401  (imported when it is first needed)
 
-from pipeline.config import load_campaign
-from pipeline.diagnosis import multi_position, turntable
+from pipeline.app.config import load_campaign
+from pipeline.evaluation.diagnosis import multi_position, turntable
 from pipeline.estimation.posterior import Answers
-from pipeline.one_unit import unit_of_campaign
+from pipeline.app.one_unit import unit_of_campaign
 
 if TYPE_CHECKING:
-    from pipeline.one_unit import ConfiguredUnit
+    from pipeline.app.one_unit import ConfiguredUnit
 
 
 def main(name: str) -> None:

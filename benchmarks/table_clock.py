@@ -17,7 +17,7 @@ from scipy.stats import beta
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "io"))
 from simulated_logs import as_table, beside_a_table, clock_errors
 
-from pipeline.io.clock_alignment import align
+from pipeline.ingest.clock_alignment import align
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """The package ``pipeline`` under the name of its distribution: ``import imu_calibration`` returns ``pipeline`` itself.
 
-``import imu_calibration.errors`` returns ``pipeline.errors``, so that no module is loaded twice, with classes that
+``import imu_calibration.errors`` returns ``pipeline.core.errors``, so that no module is loaded twice, with classes that
 differ.
 """
 

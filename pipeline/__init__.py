@@ -24,16 +24,16 @@ The measurement equation
     reading : (3,) output of the sensor, g or deg/s
     bias    : (3,) same unit
     matrix  : (3, 3) the calibration matrix: scale factor, misalignment and non-orthogonality together
-    effects : functions of the motion, the temperature and the time; see ``pipeline.model.effects``
-    noise   : white noise plus a Gauss-Markov bias wander; see ``pipeline.records.Noise``
+    effects : functions of the motion, the temperature and the time; see ``pipeline.physics.effects``
+    noise   : white noise plus a Gauss-Markov bias wander; see ``pipeline.core.records.Noise``
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import PipelineError
-from pipeline.version import VERSION
+from pipeline.core.errors import PipelineError
+from pipeline.core.version import VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -42,9 +42,9 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from pipeline.campaign_results import CampaignResults
-    from pipeline.model.compensation import Compensation
-    from pipeline.result import UnitResult
+    from pipeline.output.campaign_results import CampaignResults
+    from pipeline.physics.compensation import Compensation
+    from pipeline.app.result import UnitResult
 
 __version__ = VERSION
 __all__ = ["PipelineError", "__version__", "calibrate", "calibrate_unit", "load_calibration", "load_campaign"]
@@ -81,8 +81,8 @@ def calibrate(
     PipelineError
         The error whose code, message and file a run publishes for a failed unit.
     """
-    from pipeline.one_unit import unit_without_campaign  # noqa: PLC0415  (Hydra is imported only where needed)
-    from pipeline.result import UnitResult  # noqa: PLC0415
+    from pipeline.app.one_unit import unit_without_campaign  # noqa: PLC0415  (Hydra is imported only where needed)
+    from pipeline.app.result import UnitResult  # noqa: PLC0415
 
     chosen = {"sensor": sensor, "table": table, "procedure": procedure, "method": method}
     configured = unit_without_campaign(recordings, chosen, overrides, python_effects)
@@ -119,16 +119,16 @@ def calibrate_unit(
         ``ConfigurationError`` if the campaign, the unit or a setting is not valid; else the error whose code, message
         and file a run publishes for a failed unit.
     """
-    from pipeline.config import load_campaign as load  # noqa: PLC0415  (Hydra is imported only where needed)
-    from pipeline.config.layers import as_list  # noqa: PLC0415
-    from pipeline.one_unit import (  # noqa: PLC0415
+    from pipeline.app.config import load_campaign as load  # noqa: PLC0415  (Hydra is imported only where needed)
+    from pipeline.app.config.layers import as_list  # noqa: PLC0415
+    from pipeline.app.one_unit import (  # noqa: PLC0415
         files_of_effects,
         notes_of_campaign,
         require_simulated,
         unit_of_campaign,
     )
-    from pipeline.outcome import DEFAULT_RESULTS  # noqa: PLC0415
-    from pipeline.result import UnitResult  # noqa: PLC0415
+    from pipeline.output.outcome import DEFAULT_RESULTS  # noqa: PLC0415
+    from pipeline.app.result import UnitResult  # noqa: PLC0415
 
     settings: Mapping[str, Any] = {
         "campaign": str(campaign),
@@ -158,7 +158,7 @@ def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()
     ConfigurationError
         If an effect is unknown, or is a Python effect whose file is not in ``python_effects``.
     """
-    from pipeline.model.compensation import load  # noqa: PLC0415  (numpy is imported only where it is needed)
+    from pipeline.physics.compensation import load  # noqa: PLC0415  (numpy is imported only where it is needed)
 
     return load(path, python_effects)
 
@@ -169,6 +169,6 @@ def load_campaign(folder: str | Path) -> CampaignResults:
     The tables are ``.summary``, ``.parameters``, ``.errors``, ``.diagnosis``, ``.effects``, ``.noise`` and ``.chips``;
     ``.unit(name)`` is one unit.
     """
-    from pipeline.campaign_results import CampaignResults  # noqa: PLC0415  (pandas, only where it is needed)
+    from pipeline.output.campaign_results import CampaignResults  # noqa: PLC0415  (pandas, only where it is needed)
 
     return CampaignResults(folder)

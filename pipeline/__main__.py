@@ -7,12 +7,12 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-from pipeline.stages import MODULES as STAGES
+from pipeline.app.steps import MODULES as STAGES
 
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # a job is one core; set before numpy is imported
 
-COMMANDS = {  # name: module and function in pipeline/commands
+COMMANDS = {  # name: module and function in pipeline/app/commands
     **{name: (name, "main") for name in ("run", "new", "check", "plan", "guide", "explain", "add")},
     "remove": ("add", "remove"),
     **{name: (name, "main") for name in ("convert", "apply", "noise", "simulate", "unpack", "config")},
@@ -59,7 +59,7 @@ def main(argv: list[str] | None = None) -> int:
     if command == "job-server":  # started by workflow/rules/common.smk
         import socket  # noqa: PLC0415
 
-        from pipeline.stages.job_server import serve  # noqa: PLC0415
+        from pipeline.app.steps.job_server import serve  # noqa: PLC0415
 
         return serve(socket.socket(fileno=int(rest[0])), run_command)
     if command not in (*COMMANDS, *STAGES):
@@ -71,16 +71,16 @@ def main(argv: list[str] | None = None) -> int:
 
 def run_command(words: list[str]) -> int:
     """Run a known command in this process."""
-    from pipeline.errors import UNKNOWN_LAYOUT, PipelineError  # noqa: PLC0415
-    from pipeline.user_cache import use_cache  # noqa: PLC0415
+    from pipeline.core.errors import UNKNOWN_LAYOUT, PipelineError  # noqa: PLC0415
+    from pipeline.core.user_cache import use_cache  # noqa: PLC0415
 
     use_cache()
     command, *rest = words
     try:
         if command in COMMANDS:
             module, function = COMMANDS[command]
-            return int(getattr(import_module(f"pipeline.commands.{module}"), function)(rest))
-        return int(import_module("pipeline.stages.batch").main(command, rest))
+            return int(getattr(import_module(f"pipeline.app.commands.{module}"), function)(rest))
+        return int(import_module("pipeline.app.steps.batch").main(command, rest))
     except PipelineError as error:
         print(f"{PROGRAM} {command}: {error}", file=sys.stderr)
         if error.code in UNKNOWN_LAYOUT:

@@ -1,7 +1,7 @@
 """Calibrate one unit: the chain of its steps, in memory or, one rule of the workflow for each, through files.
 
 A step is a function of its inputs and of the settings that it reads. A run loads the inputs of a step from the files of
-earlier jobs (``pipeline.stages.unit_files``), calls ``run_step``, and stores the result. ``run_steps`` calls all steps
+earlier jobs (``pipeline.app.steps.unit_files``), calls ``run_step``, and stores the result. ``run_steps`` calls all steps
 of a unit in memory; ``pipeline.calibrate``, the commands, the study and the tests use it.
 """
 
@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from pipeline.pack import Pack
-    from pipeline.records import Fit, Recording, UnitRecordings, Validation
-    from pipeline.settings import Settings
+    from pipeline.core.pack import Pack
+    from pipeline.core.records import Fit, Recording, UnitRecordings, Validation
+    from pipeline.core.settings import Settings
 
 
 class Step(NamedTuple):
     """A step of the chain."""
 
-    function: str  # module of pipeline.stages, and its function
+    function: str  # module of pipeline.app.steps, and its function
     reads: tuple[str, ...]  # attributes of ``UnitState`` that the function takes, beside ``settings``
     settings: tuple[str, ...]  # sections of ``Settings`` that it reads; a change in another repeats no job
     returns: str  # attribute of ``UnitState`` that it returns; of ``fits``, the entry of one sensor
@@ -85,7 +85,7 @@ class UnitState:
     recordings: UnitRecordings | None = None
     fits: dict[str, Fit] = field(default_factory=dict)  # by sensor, after the last stage so far
     validated: Validation | None = None
-    diagnosed: Any = None  # ``pipeline.stages.diagnose.Diagnosis``
+    diagnosed: Any = None  # ``pipeline.app.steps.diagnose.Diagnosis``
     calibration: dict[str, Any] | None = None  # ``calibrations/<unit>.json``
     exports: dict[str, str] | None = None  # ``exports/<unit>/``: text by file
     pages: dict[str, Any] | None = None  # page and certificates, by their path below ``reports/``
@@ -143,7 +143,7 @@ def run_step(task: Task, state: Any, settings: Settings) -> Any:  # noqa: ANN401
     module, _, function = step.function.rpartition(".")
     options = {"sensor": task.sensor, "stage": task.stage, "last": task.last} if task.sensor else {}
     inputs = {name: getattr(state, name) for name in step.reads}
-    return getattr(import_module(f"pipeline.stages.{module}"), function)(**inputs, settings=settings, **options)
+    return getattr(import_module(f"pipeline.app.steps.{module}"), function)(**inputs, settings=settings, **options)
 
 
 def run_steps(state: UnitState, tasks: Iterator[Task], settings_of: Callable[[Task], Settings]) -> UnitState:

@@ -18,7 +18,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.chip_fit import Chip
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.stages import fit_stage
-from pipeline.records import Recording
+from pipeline.core.records import Recording
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 Calls = Counter[tuple[str, str]]  # function, and recording if it has one
 ONCE_A_RECORDING = (
-    "pipeline.model.kinematics._motion_of_turn",
-    "pipeline.model.kinematics._motion_of_attitude",
-    "pipeline.signal.filters.smooth_temperature",
-    "pipeline.signal.encoder_rate._rate_of",
-    "pipeline.signal.rests.find_rests",
-    "pipeline.signal.rests.rests_from_table",
+    "pipeline.physics.kinematics._motion_of_turn",
+    "pipeline.physics.kinematics._motion_of_attitude",
+    "pipeline.physics.signal.filters.smooth_temperature",
+    "pipeline.physics.signal.encoder_rate._rate_of",
+    "pipeline.physics.signal.rests.find_rests",
+    "pipeline.physics.signal.rests.rests_from_table",
 )
 ONCE_A_RECORDING_AND_SENSOR = ("pipeline.estimation.observations._part",)
-OF_STEPS = tuple(f"pipeline.stages.{step.function}" for step in STEPS.values())
+OF_STEPS = tuple(f"pipeline.app.steps.{step.function}" for step in STEPS.values())
 
 
 @contextmanager

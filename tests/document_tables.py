@@ -20,7 +20,7 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / name) for name in ("imu_logs",
 import bad_logs  # noqa: E402
 import bad_units  # noqa: E402
 
-from pipeline.exports import Format, formats  # noqa: E402
+from pipeline.output.exports import Format, formats  # noqa: E402
 
 PLACE = re.compile(r"(<!-- (\w+): tests/document_tables\.py -->\n).*?(<!-- end -->)", re.DOTALL)
 CASES_OF = ((bad_logs.INPUTS, bad_logs.cases()), (bad_units.INPUTS, bad_units.cases()))

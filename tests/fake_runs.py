@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 from stage_files import write_pack
 
-from pipeline.config import load_campaign
-from pipeline.config.campaign import UnitRow
-from pipeline.config.owner import check_owner, claim, complete_record
-from pipeline.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch
-from pipeline.results_folder import (
+from pipeline.app.config import load_campaign
+from pipeline.app.config.campaign import UnitRow
+from pipeline.app.config.owner import check_owner, claim, complete_record
+from pipeline.core.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch
+from pipeline.app.results_folder import (
     NEW_FOLDER,
     PUBLISHED_PATHS,
     _digest,
@@ -31,13 +31,13 @@ from pipeline.results_folder import (
     repetitions,
     take_run,
 )
-from pipeline.stages import gather
+from pipeline.app.steps import gather
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.config.campaign import Campaign
-    from pipeline.config.owner import Checked
+    from pipeline.app.config.campaign import Campaign
+    from pipeline.app.config.owner import Checked
 
 BATCH = "method-0001"
 

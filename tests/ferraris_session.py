@@ -11,14 +11,14 @@ from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.signal.rests import find_rests
-from pipeline.signal.segments import cut, held_out_windows
+from pipeline.physics.signal.rests import find_rests
+from pipeline.physics.signal.segments import cut, held_out_windows
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording, SensorCalibration
-    from pipeline.settings import Settings
+    from pipeline.core.records import Recording, SensorCalibration
+    from pipeline.core.settings import Settings
 
 PROCEDURE = shipped_settings(procedure="ferraris").procedure
 FITS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}

@@ -17,8 +17,8 @@ from pipeline.simulation.description import UnitDescription
 from tests.published import diagnose
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording, SensorCalibration
-    from pipeline.settings import Settings
+    from pipeline.core.records import Recording, SensorCalibration
+    from pipeline.core.settings import Settings
 
 METHODS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
 WARM = {"warm_up": 25.0}  # degC in a session of some minutes: a unit that is heated

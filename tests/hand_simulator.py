@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from unit_settings import settings_of
 
-from pipeline.records import Recording
+from pipeline.core.records import Recording
 
 if TYPE_CHECKING:
-    from pipeline.settings import Settings
+    from pipeline.core.settings import Settings
 
 Array = np.ndarray
 FINE = 4  # steps of the attitude's integral in a sample

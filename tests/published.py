@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.diagnosis.diagnose import diagnose as diagnosis_of
-from pipeline.records import Candidate, Noise, SensorValidation, StepErrors, Validation
-from pipeline.validation import heldout
+from pipeline.evaluation.diagnosis.diagnose import diagnose as diagnosis_of
+from pipeline.core.records import Candidate, Noise, SensorValidation, StepErrors, Validation
+from pipeline.evaluation.held_out import heldout
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

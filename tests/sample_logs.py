@@ -9,8 +9,8 @@ import numpy as np
 import yaml
 from unit_settings import sheet_of
 
-from pipeline.records import Recording
-from pipeline.settings import Procedure, RecordingFile, Sensor
+from pipeline.core.records import Recording
+from pipeline.core.settings import Procedure, RecordingFile, Sensor
 
 REPOSITORY = Path(__file__).parents[1]
 REFERENCE = REPOSITORY.parent / "shared" / "data"

@@ -12,7 +12,7 @@ from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 COURSE = {"step_deg": 30.0, "validation_s": 60.0, "static_s": 20.0}
 

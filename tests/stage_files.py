@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from pipeline.exports import exports
-from pipeline.io.arrow import from_parquet, to_parquet
-from pipeline.pack import Pack, as_bytes, new_pack
+from pipeline.output.exports import exports
+from pipeline.ingest.arrow import from_parquet, to_parquet
+from pipeline.core.pack import Pack, as_bytes, new_pack
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from pipeline.records import Recording
-    from pipeline.settings import Settings
+    from pipeline.core.records import Recording
+    from pipeline.core.settings import Settings
 
 
 def write_pack(path: Path, files: dict[str, Any]) -> Path:

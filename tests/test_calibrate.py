@@ -26,15 +26,15 @@ from imu_calibration.model.effects import catalogue as same_catalogue
 
 import pipeline
 import pipeline.unit
-from pipeline.commands import apply, simulate
-from pipeline.config import load_campaign
-from pipeline.errors import InputError, InternalError
-from pipeline.model.effects import catalogue
-from pipeline.one_unit import ConfiguredUnit, notes_of_campaign
-from pipeline.verdicts import Verdict
+from pipeline.app.commands import apply, simulate
+from pipeline.app.config import load_campaign
+from pipeline.core.errors import InputError, InternalError
+from pipeline.physics.effects import catalogue
+from pipeline.app.one_unit import ConfiguredUnit, notes_of_campaign
+from pipeline.core.verdicts import Verdict
 
 if TYPE_CHECKING:
-    from pipeline.result import UnitResult
+    from pipeline.app.result import UnitResult
     from pipeline.unit import UnitState
 
 COURSE = "--units 1 --sensor mpu6050 --quiet --step 45 --dwell 1 --rates 60 --validation 30 --seed 4"
@@ -226,7 +226,7 @@ def test_the_error_of_a_bug_and_of_the_machine(folder: Path, monkeypatch: pytest
     def fails(*_: object) -> None:
         raise failure
 
-    monkeypatch.setattr("pipeline.stages.ingest.check_recordings", fails)
+    monkeypatch.setattr("pipeline.app.steps.ingest.check_recordings", fails)
     failure: Exception = ZeroDivisionError("by zero")
     with pytest.raises(InternalError, match=r"ZeroDivisionError: by zero \(a bug") as bug:
         pipeline.calibrate(folder, **BENCH)
@@ -482,7 +482,7 @@ with result._configured.environment():
     print({library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"})
 print(written, started)
 result.save(out)
-from pipeline.commands import apply
+from pipeline.app.commands import apply
 words = ["--calibration", f"{out}/calibrations/U001.json", f"{folder}/validation.csv", "-o", f"{out}/log.csv"]
 code = apply.main(words)
 print(code, abs(pandas.read_csv(f"{out}/log.csv") - calibrated).to_numpy().max() < 1e-12)

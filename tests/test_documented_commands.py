@@ -64,7 +64,7 @@ NOT_RUN = {  # by the start of the command, and why
     "snakemake --profile profiles/slurm": "python -m pytest -m slurm runs it",
     "snakemake --profile profiles/kubernetes": "needs its executor: docs/fleet.md states the dry run",
     "snakemake --profile profiles/aws": "needs its executor: docs/fleet.md states the dry run",
-    "python -m pipeline.field_logs.ros2_node": "needs ROS 2; tests/commands play a log to it",
+    "python -m pipeline.app.field_logs.ros2_node": "needs ROS 2; tests/commands play a log to it",
     "python -m pipeline guide": "waits for a growing log; tests/commands run it",
     "python -m pipeline thesis seeds": "some minutes; tests/thesis makes some of its rows",
     "python -m pytest": "the tests themselves",
@@ -113,7 +113,7 @@ def test_the_options_of_commands_exist(document: Path, monkeypatch: pytest.Monke
             if rest:
                 module, function = COMMANDS[name]
                 with pytest.raises(Parsed):
-                    getattr(import_module(f"pipeline.commands.{module}"), function)(rest)
+                    getattr(import_module(f"pipeline.app.commands.{module}"), function)(rest)
             else:
                 assert name in COMMANDS
         elif words[0] == "snakemake" and "--config" in words:

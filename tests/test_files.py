@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import pytest
 
-from pipeline.files import json_text, write_atomically, write_json
+from pipeline.core.files import json_text, write_atomically, write_json
 
 if TYPE_CHECKING:
     from pathlib import Path

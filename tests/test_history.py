@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.history import difference, digest, dropped, flat, of_units, read_history, record, unit_state
-from pipeline.outcome import outcome
+from pipeline.core.errors import InputError
+from pipeline.output.history import difference, digest, dropped, flat, of_units, read_history, record, unit_state
+from pipeline.output.outcome import outcome
 
 SETTINGS = {"campaign": "bench"}
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from snakemake.cli import parse_config
 
-from pipeline.outcome import (
+from pipeline.output.outcome import (
     _reasons,
     add_command,
     as_overrides,

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stage_files import write_pack
 
-from pipeline.errors import DamagedFileError
-from pipeline.pack import Pack, as_bytes, directory_of, new_pack
+from pipeline.core.errors import DamagedFileError
+from pipeline.core.pack import Pack, as_bytes, directory_of, new_pack
 
 FILES = {"U1.json": {"bias": [0.1, -0.2]}, "U1.html": "<p>\N{DEGREE SIGN}C</p>" * 40, "U1.parquet": bytes(range(256))}
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from pipeline import run_progress
-from pipeline.results_folder import BusyError, hold_as_job, jobs_running, release_locks, take_run
-from pipeline.run_progress import Progress, _cause, duration
+from pipeline.app.results_folder import BusyError, hold_as_job, jobs_running, release_locks, take_run
+from pipeline.app.run_progress import Progress, _cause, duration
 
 
 def test_the_line_names_the_unit_at_work_the_units_done_and_the_time_left(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_results_are_held_by_one_run_and_jobs_are_seen(tmp_path: Path) -> None:
 
 
 def test_a_process_closes_its_locks_at_its_end(tmp_path: Path) -> None:
-    holding = "import sys, pathlib, pipeline.results_folder as r; r.hold_as_job(pathlib.Path(sys.argv[1]))"
+    holding = "import sys, pathlib, pipeline.app.results_folder as r; r.hold_as_job(pathlib.Path(sys.argv[1]))"
     command = [sys.executable, "-W", "always", "-c", holding, str(tmp_path)]
     done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True)
     assert not done.stderr

@@ -12,8 +12,8 @@ import jinja2
 import pytest
 
 from pipeline import user_cache
-from pipeline.compiled_templates import CompiledTemplates
-from pipeline.user_cache import cache_folder, from_cache, to_cache
+from pipeline.core.compiled_templates import CompiledTemplates
+from pipeline.core.user_cache import cache_folder, from_cache, to_cache
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

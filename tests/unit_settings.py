@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.estimation.noise import with_noises
-from pipeline.settings import SECTIONS, DataSheet, Filter, Ingest, Procedure, Section, Sensor, Settings, Table
+from pipeline.core.settings import SECTIONS, DataSheet, Filter, Ingest, Procedure, Section, Sensor, Settings, Table
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Recording, UnitRecordings
+    from pipeline.core.records import Recording, UnitRecordings
 
 IDEAL_SHEET = {
     "full_scale": 1e6,

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config import load_campaign, settings_of_jobs
-from pipeline.config.owner import check_owner, claim, complete_record
-from pipeline.io.digests import digests_of_files
-from pipeline.model.effects import forget
-from pipeline.results_folder import read_owner, release_locks
-from pipeline.stages import batch
+from pipeline.app.config import load_campaign, settings_of_jobs
+from pipeline.app.config.owner import check_owner, claim, complete_record
+from pipeline.ingest.digests import digests_of_files
+from pipeline.physics.effects import forget
+from pipeline.app.results_folder import read_owner, release_locks
+from pipeline.app.steps import batch
 
 if TYPE_CHECKING:
     from collections.abc import Collection
     from pathlib import Path
 
-    from pipeline.config.campaign import Campaign
+    from pipeline.app.config.campaign import Campaign
 
 
 def settings_names(campaign: Campaign) -> dict[str, str]:

@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.design import EffectColumns, NormalPrior, placed
 from pipeline.estimation.free_curves import MAX_BEND_SHARE_OF_ROOM, Bend
 from pipeline.estimation.gates import possible
-from pipeline.model.effects import catalogue, effect, stated_priors
-from pipeline.model.effects.base import parameter_limits
-from pipeline.model.effects.mounting import SETUP_EFFECTS
+from pipeline.physics.effects import catalogue, effect, stated_priors
+from pipeline.physics.effects.base import parameter_limits
+from pipeline.physics.effects.mounting import SETUP_EFFECTS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.estimation.observations import Observations
-    from pipeline.model.effects.base import Effect
-    from pipeline.records import Motion, Recording, SensorCalibration, Values
-    from pipeline.settings import DataSheet, Settings, Table
+    from pipeline.physics.effects.base import Effect
+    from pipeline.core.records import Motion, Recording, SensorCalibration, Values
+    from pipeline.core.settings import DataSheet, Settings, Table
 
 AUTO = "auto"  # instead of a list of effects: the effects that the diagnosis selects
 MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"

@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import scipy
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, scaled_inverse
 from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.estimation.noise import noise_of, wander_prior
 from pipeline.estimation.observations import BIAS_BLOCKS, SHORTEST_BLOCK_S
-from pipeline.model.compensation import Compensation
-from pipeline.model.effects.base import STANDARD_GRAVITY
-from pipeline.model.kinematics import skew, turn_by_vector
-from pipeline.records import MEDIAN_SIZE, SENSORS, Mask, Recording, SensorCalibration, Values, noise_of_steps
+from pipeline.physics.compensation import Compensation
+from pipeline.physics.effects.base import STANDARD_GRAVITY
+from pipeline.physics.kinematics import skew, turn_by_vector
+from pipeline.core.records import MEDIAN_SIZE, SENSORS, Mask, Recording, SensorCalibration, Values, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.settings import Sensor
+    from pipeline.core.settings import Sensor
 
 ChannelValues: TypeAlias = "dict[str, Values]"
 

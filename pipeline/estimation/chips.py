@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.chip_fit import (
     PRIORS,
     ROW_S,
@@ -41,8 +41,8 @@ from pipeline.estimation.chip_fit import (
 from pipeline.estimation.engine import assess_noise, scaled_inverse
 from pipeline.estimation.gauss_markov import WanderPrior
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom, own_and_bench
-from pipeline.model.kinematics import turn_by_vector
-from pipeline.records import (
+from pipeline.physics.kinematics import turn_by_vector
+from pipeline.core.records import (
     AXES,
     MATRIX,
     SENSOR_UNITS,

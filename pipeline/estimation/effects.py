@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.candidates import AUTO, MOUNTING, configured_effects, offered
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
 from pipeline.estimation.stages import FitStage
-from pipeline.model.effects import bench_priors, effect, stated_priors
-from pipeline.records import SensorCalibration
+from pipeline.physics.effects import bench_priors, effect, stated_priors
+from pipeline.core.records import SensorCalibration
 
 if TYPE_CHECKING:
     from pipeline.estimation.stages import Change
-    from pipeline.records import UnitRecordings
-    from pipeline.settings import Settings
+    from pipeline.core.records import UnitRecordings
+    from pipeline.core.settings import Settings
 
 ALL: tuple[Change, ...] = ("bias", "matrix", "effects")
 FIT_STAGES = {"effects": FitStage(changes=ALL, accepts=("readings", *ALL), free=True, reference=True)}

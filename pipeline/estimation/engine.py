@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting, WanderPrior
-from pipeline.records import Index, Values, noise_of_steps
+from pipeline.core.records import Index, Values, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -24,7 +24,7 @@ from pipeline.estimation.least_squares import cholesky
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Index, Values
+    from pipeline.core.records import Index, Values
 
 Pick: TypeAlias = tuple[int, int]  # version and scale of an effect
 EffectSet: TypeAlias = frozenset[str]

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.candidates import MOUNTING
-from pipeline.records import AXES, coverage_factor
+from pipeline.core.records import AXES, coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.records import Recording, SensorCalibration, Values
-    from pipeline.settings import Settings
+    from pipeline.core.records import Recording, SensorCalibration, Values
+    from pipeline.core.settings import Settings
 
 NORMAL_FACTOR = float(coverage_factor(np.inf))
 FACES_ABOUT, TURNS_ABOUT = 4, 2  # faces, and axes of turns, that show a rotation about one axis

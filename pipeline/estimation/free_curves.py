@@ -22,12 +22,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
-from pipeline.model.effects.base import Effect, EffectParameter, Layout, Owner, axis_parameters, length, truth, unit_of
+from pipeline.physics.effects.base import Effect, EffectParameter, Layout, Owner, axis_parameters, length, truth, unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.records import Motion, Values
+    from pipeline.core.records import Motion, Values
 
 OTHER_PREFIX = "other_"  # prefix of the names of free curves
 BEND = ":bend"  # suffix of the name of the second form; answers state it under the name of the first

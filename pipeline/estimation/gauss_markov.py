@@ -36,7 +36,7 @@ import scipy
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from pipeline.records import Index, Integers, Noise, Values
+    from pipeline.core.records import Index, Integers, Noise, Values
 
 DEFAULT_TIME_S = 100.0  # correlation time if the sensor file gives none: of MEMS sensors, by IEEE Std 952 examples
 STATED_WIDTH = float(np.log(3.0))  # of the logarithm of a bias instability that a sensor file gives: a factor of three

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed, parameter_names, require_available, starts_of
 from pipeline.estimation.design import (
     Design,
@@ -48,9 +48,9 @@ from pipeline.estimation.uncertainty_budget import (
     noise_contribution,
     scatter_contribution,
 )
-from pipeline.model.effects.base import Layout, truth
-from pipeline.model.effects.mounting import Mounting, errors_in_mean_frame, in_mean_frame
-from pipeline.records import (
+from pipeline.physics.effects.base import Layout, truth
+from pipeline.physics.effects.mounting import Mounting, errors_in_mean_frame, in_mean_frame
+from pipeline.core.records import (
     AFTER_BASE,
     BASE,
     BASE_COUNT,
@@ -71,7 +71,7 @@ from pipeline.records import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.settings import Settings
+    from pipeline.core.settings import Settings
 
 
 MAX_ITERATIONS = 25  # of Gauss-Newton

@@ -3,7 +3,7 @@
     reading - z(motion, K; p) = bias + K @ truth + noise
 
 with the effects z and known parameters p that a stage of the method states (``FitStage.known``). ``truth`` is that of
-the readings themselves by bias and matrix so far (``pipeline.model.measurement``), so that no table is needed. An
+the readings themselves by bias and matrix so far (``pipeline.physics.measurement``), so that no table is needed. An
 effect of the same name that is fitted to the corrected readings is what the known parameters leave: the calibration has
 the sum.
 """
@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError
+from pipeline.core.errors import CannotCalibrateError
 from pipeline.estimation.uncertainty_budget import with_uncertainty
-from pipeline.model.effects.base import with_truth
-from pipeline.model.measurement import SensorEffects, compensate
-from pipeline.records import (
+from pipeline.physics.effects.base import with_truth
+from pipeline.physics.measurement import SensorEffects, compensate
+from pipeline.core.records import (
     BASE_NAMES,
     FittedEffect,
     MonteCarlo,
@@ -30,13 +30,13 @@ from pipeline.records import (
     Values,
     motion_at_rest,
 )
-from pipeline.signal.filters import temperature_of
+from pipeline.physics.signal.filters import temperature_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import StageResult
-    from pipeline.settings import Method
+    from pipeline.core.records import StageResult
+    from pipeline.core.settings import Method
 
 SOURCE = "known effects"  # of the uncertainty budget
 

@@ -18,16 +18,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError
+from pipeline.core.errors import ConfigurationError
 from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.stages import FitStage
-from pipeline.model.effects import effect
-from pipeline.model.effects.base import REFERENCE_TEMPERATURE
-from pipeline.records import Estimate, FittedEffect, SensorCalibration, StageResult
+from pipeline.physics.effects import effect
+from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
+from pipeline.core.records import Estimate, FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
-    from pipeline.records import UnitRecordings
-    from pipeline.settings import DataSheet, Settings
+    from pipeline.core.records import UnitRecordings
+    from pipeline.core.settings import DataSheet, Settings
 
 NAME = "known_temperature"
 

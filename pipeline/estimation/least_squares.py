@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from pipeline.records import Values
+    from pipeline.core.records import Values
 
 FitState = TypeVar("FitState")
 MAX_STEP_HALVINGS = 30  # of a step; a smaller one is rounding

@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.estimation.engine import ErrorMixture, draw_normal
-from pipeline.records import AFTER_BASE, BIAS, MATRIX, MonteCarlo
+from pipeline.core.records import AFTER_BASE, BIAS, MATRIX, MonteCarlo
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import ArrayLike
 
-    from pipeline.records import Contribution, Mask, SensorCalibration, Values
+    from pipeline.core.records import Contribution, Mask, SensorCalibration, Values
 
     Draw = Callable[[np.random.Generator, int], Values]
 

@@ -1,6 +1,6 @@
 """Estimate the noise of a sensor from its recordings, and the prior of its bias wander for a fit.
 
-    noise[n] = white * w[n] + wander * m[n]        (``pipeline.records.Noise``)
+    noise[n] = white * w[n] + wander * m[n]        (``pipeline.core.records.Noise``)
 
 with unit white noise w and a unit first-order Gauss-Markov process m. The first of these sources that exists determines
 the noise:
@@ -8,7 +8,7 @@ the noise:
 1. ``static``: a long rest. Temperature and warm-up, which would look like wander, are regressed out. The scatter within
    the rests of the other recordings is also used for the white noise, if it agrees.
 2. ``rests``: the rests of the other recordings, each with a separate mean. In recordings by hand the unit creeps
-   (``pipeline.signal.quiet_motion``): gravity moves from one axis to another, which is not wander of a bias. The
+   (``pipeline.physics.signal.quiet_motion``): gravity moves from one axis to another, which is not wander of a bias. The
    accelerometer's wander is then estimated from the component along gravity, and its white noise from the scatter about
    a parabola in time. A hand trembles in place: the integral of its rate is bounded. So the correlation time is at most
    the length of a rest. With the 100 s of a sensor file, a tremor of 0.4 deg/s would be a wander of 1 deg/s.
@@ -52,7 +52,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.errors import ConfigurationError, InputError
+from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.estimation.gauss_markov import (
     MAX_PRIOR_WIDTHS,
     SHARPEST_WIDTH,
@@ -66,7 +66,7 @@ from pipeline.estimation.gauss_markov import (
     orthonormal,
     variance_of_average,
 )
-from pipeline.records import (
+from pipeline.core.records import (
     NOISE_OF_ROWS,
     SENSORS,
     Noise,
@@ -76,15 +76,15 @@ from pipeline.records import (
     median,
     noise_of_steps,
 )
-from pipeline.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
-from pipeline.signal.quiet_motion import coarse_steps, component_along_gravity, creep_of_readings
-from pipeline.signal.rests import rest_readings, stretches_of, usable
+from pipeline.physics.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
+from pipeline.physics.signal.quiet_motion import coarse_steps, component_along_gravity, creep_of_readings
+from pipeline.physics.signal.rests import rest_readings, stretches_of, usable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Integers, Mask, SensorCalibration, Values
-    from pipeline.settings import DataSheet, Sensor
+    from pipeline.core.records import Integers, Mask, SensorCalibration, Values
+    from pipeline.core.settings import DataSheet, Sensor
 
 MOVING = ("soak", "slow")  # kinds of recordings whose readings change slowly by more than noise
 CORRELATION_TIME_FACTORS = np.exp2(np.arange(-6.0, 4.0))  # correlation times of the grid, over that of the sensor file

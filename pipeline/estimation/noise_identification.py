@@ -46,17 +46,17 @@ from pipeline.estimation.noise_terms import (
     spectrum_of,
     unit_of,
 )
-from pipeline.records import AXES, SENSOR_UNITS, SENSORS
-from pipeline.signal.filters import temperature_of
-from pipeline.signal.rests import rest_readings, usable
+from pipeline.core.records import AXES, SENSOR_UNITS, SENSORS
+from pipeline.physics.signal.filters import temperature_of
+from pipeline.physics.signal.rests import rest_readings, usable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.estimation.noise_search import FittedComposition
     from pipeline.estimation.noise_terms import Spectrum
-    from pipeline.files import JSON
-    from pipeline.records import Recording, Values
+    from pipeline.core.files import JSON
+    from pipeline.core.records import Recording, Values
 
 
 MIN_SPECTRUM_SAMPLES = 60  # which determine the white noise to a tenth

@@ -45,13 +45,13 @@ from pipeline.estimation.noise_terms import (
     solved,
     spectrum_of,
 )
-from pipeline.records import median
+from pipeline.core.records import median
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from pipeline.estimation.noise_terms import Spectrum, Work
-    from pipeline.records import Values
+    from pipeline.core.records import Values
 
 MOST_MARKOV = 2  # processes of different correlation times; to distinguish a third takes some 10^6 samples
 TIMES_SCORED = 10  # correlation times whose score is computed, in equal steps of their logarithm

@@ -50,7 +50,7 @@ import scipy
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
 
-    from pipeline.records import Integers, Mask, Values
+    from pipeline.core.records import Integers, Mask, Values
 
 QUANTISATION, WHITE, INSTABILITY, WALK, MARKOV = range(5)
 PER_AVERAGE = 64  # overlapping terms of the sum in one average

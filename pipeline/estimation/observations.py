@@ -23,18 +23,18 @@ import numpy as np
 from pipeline.estimation.gauss_markov import Blocks, constant_bias_s, information
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.estimation.turns import RowGroups, reference_valid, rows_of
-from pipeline.model.effects import stated_priors
-from pipeline.model.effects.base import turning_direction
-from pipeline.model.kinematics import earth_of, table_motion
-from pipeline.records import once, once_of_log
-from pipeline.signal.encoder_rate import rate_by_angle
-from pipeline.signal.filters import filtered, impulse_response
+from pipeline.physics.effects import stated_priors
+from pipeline.physics.effects.base import turning_direction
+from pipeline.physics.kinematics import earth_of, table_motion
+from pipeline.core.records import once, once_of_log
+from pipeline.physics.signal.encoder_rate import rate_by_angle
+from pipeline.physics.signal.filters import filtered, impulse_response
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from pipeline.records import Mask, Motion, Noise, Recording, Values
-    from pipeline.settings import Table
+    from pipeline.core.records import Mask, Motion, Noise, Recording, Values
+    from pipeline.core.settings import Table
 
 
 ROLES = ("accelerometer", "gyroscope", "static")

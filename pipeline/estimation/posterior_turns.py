@@ -20,13 +20,13 @@ from pipeline.estimation.generalized_least_squares import JointFit, design_at, f
 from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import MIN_NEW_COLUMN_SHARE, without
 from pipeline.estimation.selection import DELAYS, Selection
-from pipeline.records import BASE_COUNT
+from pipeline.core.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from pipeline.model.effects.base import Effect
-    from pipeline.records import Values
+    from pipeline.physics.effects.base import Effect
+    from pipeline.core.records import Values
 
 
 WORTH_A_FIT = 0.01  # probability of the sets with the same other timing effects, above which these are fitted

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.candidates import bench_effects
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.generalized_least_squares import fit_joint
@@ -40,14 +40,14 @@ from pipeline.estimation.stages import FitStage
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, settled, used_motions
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
-from pipeline.model.effects import stated_priors
-from pipeline.model.effects.base import truth
-from pipeline.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageResult, Values
-from pipeline.signal.filters import filtered
+from pipeline.physics.effects import stated_priors
+from pipeline.physics.effects.base import truth
+from pipeline.core.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageResult, Values
+from pipeline.physics.signal.filters import filtered
 
 if TYPE_CHECKING:
-    from pipeline.records import UnitRecordings
-    from pipeline.settings import Settings
+    from pipeline.core.records import UnitRecordings
+    from pipeline.core.settings import Settings
 
 
 NAME = "reference_least_squares"

@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError
+from pipeline.core.errors import CannotCalibrateError
 from pipeline.estimation.turns import stop_and_go
-from pipeline.model.effects.base import REFERENCE_TEMPERATURE
-from pipeline.model.kinematics import table_motion
-from pipeline.records import NOISE_OF_ROWS, once
-from pipeline.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
-from pipeline.signal.quiet_motion import coarse_of, creep_of_rest, posterior_creep_rates, step_and_noise
-from pipeline.signal.rests import Rest, find_rests, rests_from_table, usable
+from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
+from pipeline.physics.kinematics import table_motion
+from pipeline.core.records import NOISE_OF_ROWS, once
+from pipeline.physics.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
+from pipeline.physics.signal.quiet_motion import coarse_of, creep_of_rest, posterior_creep_rates, step_and_noise
+from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, usable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Index, Integers, Mask, Recording, SensorCalibration, Values
-    from pipeline.settings import Procedure, Settings, Table
+    from pipeline.core.records import Index, Integers, Mask, Recording, SensorCalibration, Values
+    from pipeline.core.settings import Procedure, Settings, Table
 
 ROLE, HELD_OUT = "rests", "validation"
 SOAK = "soak"  # a kind of recording in the sheet
@@ -128,7 +128,7 @@ def rest_means(recording: Recording, rests: Sequence[Rest], sensor: str = "accel
     """Return the mean reading of each rest, (m, 3), g or deg/s, and the number of valid samples in it, (m,).
 
     The mean is NaN where a rest has no valid sample. By hand a unit may creep: the mean over its directions is too
-    short, which is corrected (see ``pipeline.signal.quiet_motion``).
+    short, which is corrected (see ``pipeline.physics.signal.quiet_motion``).
     """
     reading = recording.reading(sensor)
     if reading is None or not rests:

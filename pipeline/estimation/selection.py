@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
 from pipeline.estimation.design import EffectColumns, Start, ordinary_base, placed, without_unknown_motion
 from pipeline.estimation.engine import scaled_inverse
@@ -29,13 +29,13 @@ from pipeline.estimation.gauss_markov import Setting, selection_grid
 from pipeline.estimation.generalized_least_squares import JointFit, fit_best, fit_terms, require_observable
 from pipeline.estimation.observations import Observations, weighted
 from pipeline.estimation.ranking import Ranking, Score
-from pipeline.model.effects import effect
+from pipeline.physics.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.records import Noise, SensorCalibration, Values
-    from pipeline.settings import DataSheet
+    from pipeline.core.records import Noise, SensorCalibration, Values
+    from pipeline.core.settings import DataSheet
 
 
 MAX_SELECTED_EFFECTS = 5  # effects that one selection adds

@@ -17,7 +17,7 @@ The stage ``given`` (``method=given``) is no fit: it takes bias, matrix and effe
 for validation and diagnosis with the recordings. The uncertainty is that of the file. If the file states none, the
 covariance is zero, which the budget states; any held-out error beyond noise is then an error of the calibration.
 
-``pipeline.records.correction`` describes the correction of readings by the stages so far.
+``pipeline.core.records.correction`` describes the correction of readings by the stages so far.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError, ConfigurationError
+from pipeline.core.errors import CannotCalibrateError, ConfigurationError
 from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
-from pipeline.records import (
+from pipeline.core.records import (
     BASE,
     NORMAL,
     SENSORS,
@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.estimation.engine import ResidualNoise
-    from pipeline.records import FittedEffect, UnitRecordings
-    from pipeline.settings import DataSheet, Method, Settings
+    from pipeline.core.records import FittedEffect, UnitRecordings
+    from pipeline.core.settings import DataSheet, Method, Settings
 
 GIVEN, GIVEN_SOURCE = "given", "given calibration"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null

@@ -31,8 +31,8 @@ from pipeline.estimation.uncertainty_budget import (
     clock_contribution,
     with_uncertainty,
 )
-from pipeline.model.kinematics import EARTH_RATE_DPS
-from pipeline.records import (
+from pipeline.physics.kinematics import EARTH_RATE_DPS
+from pipeline.core.records import (
     BIAS,
     MATRIX,
     NORMAL,
@@ -45,13 +45,13 @@ from pipeline.records import (
     SensorCalibration,
     Values,
 )
-from pipeline.signal.filters import temperature_of
+from pipeline.physics.signal.filters import temperature_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import UnitRecordings
-    from pipeline.settings import DataSheet, Settings, Table
+    from pipeline.core.records import UnitRecordings
+    from pipeline.core.settings import DataSheet, Settings, Table
 
 OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic", "bias_temperature_cubic")
 FITTED = {"bias": OF_THE_BIAS, "scale_factor": ("scale_factor_temperature",)}
@@ -69,7 +69,7 @@ def with_stated(
     """Add temperature, repeatability and a counted time to a calibration's budget, as far as they are known.
 
     ``recordings``: of the fit; their temperature and notes are used. ``rate_error``: e of the table's log, relative
-    (``pipeline.preprocessing.reference_scale.rate_error``).
+    (``pipeline.checks.reference_scale.rate_error``).
     """
     filtered, noise = recordings.filtered, recordings.noises[calibration.sensor]
     before, budget = calibration.covariance, calibration.budget

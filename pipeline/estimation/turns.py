@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError
+from pipeline.core.errors import CannotCalibrateError
 from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.table_errors import Reference, noise_on_table
-from pipeline.model.kinematics import table_motion
-from pipeline.signal.rests import RATE_AT_REST_DPS, runs
+from pipeline.physics.kinematics import table_motion
+from pipeline.physics.signal.rests import RATE_AT_REST_DPS, runs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from pipeline.estimation.engine import ResidualNoise
-    from pipeline.records import Index, Mask, Motion, Recording, Values
-    from pipeline.settings import Table
+    from pipeline.core.records import Index, Mask, Motion, Recording, Values
+    from pipeline.core.settings import Table
 
 
 FIT_BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings

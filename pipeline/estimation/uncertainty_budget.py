@@ -25,7 +25,7 @@ from pipeline.estimation.at_limits import changes_on_table
 from pipeline.estimation.candidates import TILT, tilt_like_zeros
 from pipeline.estimation.monte_carlo import through, with_trials
 from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
-from pipeline.records import (
+from pipeline.core.records import (
     AFTER_BASE,
     BASE_NAMES,
     LIMIT,
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.engine import LinearMap, ResidualNoise
     from pipeline.estimation.gauss_markov import WanderPrior
-    from pipeline.settings import Settings, Table
+    from pipeline.core.settings import Settings, Table
 
 # share of a variance, up to which a part of it may be chance: the lack of fit was 0 to 5 % on a table within its stated
 # accuracies, 18 to 73 % with 0.02 deg between its axes (12 simulated units each, 18 positions)

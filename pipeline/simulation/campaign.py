@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.errors import ConfigurationError
-from pipeline.io.write import write_recording
-from pipeline.records import AXES, SENSORS
+from pipeline.core.errors import ConfigurationError
+from pipeline.ingest.write import write_recording
+from pipeline.core.records import AXES, SENSORS
 from pipeline.simulation.description import course_of, shipped_settings
 from pipeline.simulation.procedures import ONE_RECORDING, plan
 from pipeline.simulation.sensor import decimals_of, drawn_effects, drawn_sensors
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.records import Recording
-    from pipeline.settings import Sensor
+    from pipeline.core.records import Recording
+    from pipeline.core.settings import Sensor
     from pipeline.simulation.description import Description, UnitDescription
     from pipeline.simulation.sensor import Hidden, SimulatedSensor
     from pipeline.simulation.trajectory import Planned

@@ -27,11 +27,11 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from imu_logs.yaml_file import read_yaml
-from pipeline.errors import ConfigurationError, MissingInputError
-from pipeline.files import CONFIGS
-from pipeline.io.files import wrong_name
-from pipeline.model.sensor_file import completed
-from pipeline.settings import SECTIONS, Settings
+from pipeline.core.errors import ConfigurationError, MissingInputError
+from pipeline.core.files import CONFIGS
+from pipeline.ingest.files import wrong_name
+from pipeline.physics.sensor_file import completed
+from pipeline.core.settings import SECTIONS, Settings
 from pipeline.simulation import REST_BY_HAND_S
 from pipeline.simulation.procedures import (
     FERRARIS,

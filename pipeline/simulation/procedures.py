@@ -17,9 +17,9 @@ import numpy as np
 from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
-from pipeline.errors import ConfigurationError
-from pipeline.io.commanded_motion import Program
-from pipeline.records import AXES
+from pipeline.core.errors import ConfigurationError
+from pipeline.ingest.commanded_motion import Program
+from pipeline.core.records import AXES
 from pipeline.simulation.trajectory import (
     CommandedTurns,
     Gimbals,
@@ -39,7 +39,7 @@ from pipeline.simulation.trajectory import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from pipeline.records import Values
+    from pipeline.core.records import Values
 
 
 ONE_RECORDING, FERRARIS = "one_recording", "ferraris"

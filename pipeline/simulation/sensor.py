@@ -37,7 +37,7 @@ mounting angles are within 1 deg (Sudsanguan 2019, chapter 3). A description may
     effects:
       gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: [0.03, 0.03, 0.03]}
 
-The keys are the keys of an effect's file (``pipeline.model.effects.declaration``), of which only ``terms`` is required,
+The keys are the keys of an effect's file (``pipeline.physics.effects.declaration``), of which only ``terms`` is required,
 and ``values``: the parameters' values, or one size; not needed where there are ``limits``. The effect is not in the
 catalogue of a diagnosis.
 """
@@ -50,19 +50,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from pipeline.errors import ConfigurationError
-from pipeline.model.effects import effect, effect_from
-from pipeline.model.effects.base import STANDARD_GRAVITY, parameter_limits, truth
-from pipeline.records import SENSORS, Motion
-from pipeline.signal.rests import still_samples
+from pipeline.core.errors import ConfigurationError
+from pipeline.physics.effects import effect, effect_from
+from pipeline.physics.effects.base import STANDARD_GRAVITY, parameter_limits, truth
+from pipeline.core.records import SENSORS, Motion
+from pipeline.physics.signal.rests import still_samples
 from pipeline.simulation.trajectory import CommandedTurns, mounted, rotation_about, rotation_by
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from pipeline.model.effects.base import Effect
-    from pipeline.records import Values
-    from pipeline.settings import DataSheet, Sensor
+    from pipeline.physics.effects.base import Effect
+    from pipeline.core.records import Values
+    from pipeline.core.settings import DataSheet, Sensor
     from pipeline.simulation.trajectory import Gimbals, RestsAndMoves
 
     Alteration = Callable[["Scene", Values], "Scene"]

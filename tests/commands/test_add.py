@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from pipeline.commands import add
-from pipeline.config.campaign import load_campaign
-from pipeline.config.devices import set_override
-from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
-from pipeline.model.effects import read_effect_file
-from pipeline.stages.diagnose import effect_file
+from pipeline.app.commands import add
+from pipeline.app.config.campaign import load_campaign
+from pipeline.app.config.devices import set_override
+from pipeline.core.errors import ConfigurationError, MissingInputError, PipelineError
+from pipeline.physics.effects import read_effect_file
+from pipeline.app.steps.diagnose import effect_file
 
 SHEET = """unit,serial,overrides
 U1,S1,

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from unit_settings import ingest_of
 
-from pipeline.commands.apply import main
-from pipeline.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
-from pipeline.field_logs.compensate import compensate_log
-from pipeline.field_logs.stream import LogProfile
-from pipeline.model.compensation import load
-from pipeline.records import FittedEffect, SensorCalibration
+from pipeline.app.commands.apply import main
+from pipeline.core.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
+from pipeline.app.field_logs.compensate import compensate_log
+from pipeline.app.field_logs.stream import LogProfile
+from pipeline.physics.compensation import load
+from pipeline.core.records import FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.commands.apply import main
-from pipeline.errors import InputError
-from pipeline.records import SensorCalibration
+from pipeline.app.commands.apply import main
+from pipeline.core.errors import InputError
+from pipeline.core.records import SensorCalibration
 
 NAMES = ["time_s", *(f"accel_{a}_g" for a in "xyz"), *(f"gyro_{a}_dps" for a in "xyz")]
 A = (np.array([0.03, -0.02, 0.05]), np.diag([1.01, 0.99, 1.02]) + np.pi * 1e-3)

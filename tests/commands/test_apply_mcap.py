@@ -17,13 +17,13 @@ from mcap_ros2.decoder import DecoderFactory
 from unit_settings import ingest_of
 
 from imu_logs.mcap_write import DEFINITIONS, IMU, TEMPERATURE
-from pipeline.commands.apply import main
-from pipeline.errors import InputError
+from pipeline.app.commands.apply import main
+from pipeline.core.errors import InputError
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.field_logs.compensate import compensate_log
-from pipeline.field_logs.stream import LogProfile
-from pipeline.model.compensation import load
-from pipeline.records import SENSORS, FittedEffect, Recording, SensorCalibration
+from pipeline.app.field_logs.compensate import compensate_log
+from pipeline.app.field_logs.stream import LogProfile
+from pipeline.physics.compensation import load
+from pipeline.core.records import SENSORS, FittedEffect, Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

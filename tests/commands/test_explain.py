@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.commands.explain import find, main
-from pipeline.errors import InputError, MissingInputError
+from pipeline.app.commands.explain import find, main
+from pipeline.core.errors import InputError, MissingInputError
 
 
 def unwrapped(text: str) -> str:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from pipeline.__main__ import main
-from pipeline.commands import guide_recording
-from pipeline.files import CONFIGS
-from pipeline.records import Recording
-from pipeline.settings import HandTurns
-from pipeline.signal.rests import find_rests
-from pipeline.signal.segments import turns_by_hand
+from pipeline.app.commands import guide_recording
+from pipeline.core.files import CONFIGS
+from pipeline.core.records import Recording
+from pipeline.core.settings import HandTurns
+from pipeline.physics.signal.rests import find_rests
+from pipeline.physics.signal.segments import turns_by_hand
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import description_from
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.commands import new
-from pipeline.commands.new import main
-from pipeline.config import load_campaign
-from pipeline.errors import ConfigurationError
+from pipeline.app.commands import new
+from pipeline.app.commands.new import main
+from pipeline.app.config import load_campaign
+from pipeline.core.errors import ConfigurationError
 
 
 def test_the_table_is_named_with_its_accuracy_and_other_ranges_are_set_as_the_comments_say(

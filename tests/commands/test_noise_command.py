@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.commands.noise import main
-from pipeline.errors import ConfigurationError
+from pipeline.app.commands.noise import main
+from pipeline.core.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from pathlib import Path

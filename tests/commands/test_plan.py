@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from pipeline.__main__ import main
-from pipeline.model.effects import forget
+from pipeline.physics.effects import forget
 
 if TYPE_CHECKING:
     from pathlib import Path

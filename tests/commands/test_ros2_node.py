@@ -12,13 +12,13 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from pipeline.commands.apply import main as apply_main
+from pipeline.app.commands.apply import main as apply_main
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.field_logs import ros2_node
-from pipeline.field_logs.ros2_node import MessageCalibrator
-from pipeline.files import write_json
-from pipeline.io.write import write_recording
-from pipeline.records import FittedEffect, Recording, SensorCalibration
+from pipeline.app.field_logs import ros2_node
+from pipeline.app.field_logs.ros2_node import MessageCalibrator
+from pipeline.core.files import write_json
+from pipeline.ingest.write import write_recording
+from pipeline.core.records import FittedEffect, Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -179,5 +179,5 @@ def test_a_message_without_a_gyroscope_keeps_its_field(calibration: Path, log: P
 
 
 def test_the_module_needs_no_ros(tmp_path: Path) -> None:
-    code = "import sys, pipeline.field_logs.ros2_node; assert not {'rclpy', 'sensor_msgs'} & set(sys.modules)"
+    code = "import sys, pipeline.app.field_logs.ros2_node; assert not {'rclpy', 'sensor_msgs'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import Campaign, load_campaign
-from pipeline.config.stage_settings import settings_in_memory
-from pipeline.errors import ConfigurationError
+from pipeline.app.config import Campaign, load_campaign
+from pipeline.app.config.stage_settings import settings_in_memory
+from pipeline.core.errors import ConfigurationError
 
 
 def campaign(tmp_path: Path, sheet: str, settings: str = "") -> Path:

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import load_campaign
-from pipeline.config.campaign import UnitRow
-from pipeline.errors import ConfigurationError
+from pipeline.app.config import load_campaign
+from pipeline.app.config.campaign import UnitRow
+from pipeline.core.errors import ConfigurationError
 
 
 def campaign(folder: Path, laboratory: str) -> Path:

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.config import load_campaign
-from pipeline.config.campaign import resolve_comparisons
-from pipeline.errors import ConfigurationError
+from pipeline.app.config import load_campaign
+from pipeline.app.config.campaign import resolve_comparisons
+from pipeline.core.errors import ConfigurationError
 
 SHEET = """unit,serial,method,rate_dps,overrides
 A1,S1,,5,

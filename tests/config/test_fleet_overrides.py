@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.__main__ import main
-from pipeline.config import Campaign, load_campaign
-from pipeline.config.options import parse
-from pipeline.config.stage_settings import in_common, settings_in_memory
-from pipeline.errors import ConfigurationError
-from pipeline.stages.batch import merge_common
+from pipeline.app.config import Campaign, load_campaign
+from pipeline.app.config.options import parse
+from pipeline.app.config.stage_settings import in_common, settings_in_memory
+from pipeline.core.errors import ConfigurationError
+from pipeline.app.steps.batch import merge_common
 
 HYDRA = OverridesParser.create()
 SHEET = """unit,serial,lot,sensor,filter,overrides

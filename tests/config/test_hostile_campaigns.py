@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import load_campaign
-from pipeline.errors import ConfigurationError
+from pipeline.app.config import load_campaign
+from pipeline.core.errors import ConfigurationError
 from pipeline.simulation.description import read_description
 
 LFS_POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'4d7a2146' * 8}\nsize 12345\n"

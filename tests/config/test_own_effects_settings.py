@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from pipeline.config import Campaign, load_campaign
-from pipeline.config.stage_settings import settings_of_jobs
-from pipeline.errors import ConfigurationError
+from pipeline.app.config import Campaign, load_campaign
+from pipeline.app.config.stage_settings import settings_of_jobs
+from pipeline.core.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,7 +25,7 @@ limits: {k: 1e-3}
 """
 TIP = BEND.replace("bend", "tip").replace("Bends", "Tips").replace("gyroscope", "accelerometer")
 CODE = """\
-from pipeline.model.effects.base import Effect, Layout, Owner, axis_parameters, truth
+from pipeline.physics.effects.base import Effect, Layout, Owner, axis_parameters, truth
 class Mine(Effect):
     name, owner, layout, sensors = "mine", Owner.SENSOR, Layout.PER_AXIS, ("gyroscope",)
     meaning = excitation = experiment = source = "mine"

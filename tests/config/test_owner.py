@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from fake_runs import as_of_version_1, campaign_of, run, sha256, units_of, write_campaign
 
-from pipeline.commands import add, explain, simulate, unpack
-from pipeline.commands import run as run_command
-from pipeline.config import load_campaign, owner
-from pipeline.config.owner import OtherCampaignError, check_owner, claim
-from pipeline.errors import ConfigurationError
-from pipeline.results_folder import read_owner, release_locks
+from pipeline.app.commands import add, explain, simulate, unpack
+from pipeline.app.commands import run as run_command
+from pipeline.app.config import load_campaign, owner
+from pipeline.app.config.owner import OtherCampaignError, check_owner, claim
+from pipeline.core.errors import ConfigurationError
+from pipeline.app.results_folder import read_owner, release_locks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from pipeline.config.campaign import Campaign
+    from pipeline.app.config.campaign import Campaign
 
 DESCRIPTION = "seed: {}\nunits: [{{unit: A, count: 2, course: {{step_deg: 30.0, validation_s: 60.0}}}}]\n"
 

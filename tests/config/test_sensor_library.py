@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
-from pipeline.config.compose import Composer
-from pipeline.config.options import Problem
-from pipeline.files import CONFIGS
+from pipeline.app.config.compose import Composer
+from pipeline.app.config.options import Problem
+from pipeline.core.files import CONFIGS
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from whole_run import settings_names
 
-from pipeline.config import load_campaign, stage_settings
-from pipeline.model.effects import built_in
-from pipeline.report import unit_page
-from pipeline.stages import MODULES
+from pipeline.app.config import load_campaign, stage_settings
+from pipeline.physics.effects import built_in
+from pipeline.output.pages import unit_page
+from pipeline.app.steps import MODULES
 
 SHEET = """unit,method,overrides
 A1,,
@@ -117,11 +117,11 @@ def test_a_change_of_sheet_or_device_concerns_the_batch_of_the_unit(tmp_path: Pa
 
 @pytest.mark.parametrize("stage", ["validate", "diagnose", "calibration", "export", "report"])
 def test_the_digest_of_a_stage_contains_the_files_of_the_built_in_effects(stage: str) -> None:
-    read = {file.name for file in stage_settings._closure(f"pipeline.stages.{stage}")}
+    read = {file.name for file in stage_settings._closure(f"pipeline.app.steps.{stage}")}
     assert {f"{name}.yaml" for name in built_in()} <= read
 
 
 def test_a_change_of_a_page_repeats_no_stage_before_the_pages() -> None:
     page = Path(unit_page.__file__)
-    of = {stage: stage_settings._closure(f"pipeline.stages.{module}") for stage, module in MODULES.items()}
+    of = {stage: stage_settings._closure(f"pipeline.app.steps.{module}") for stage, module in MODULES.items()}
     assert {stage for stage, files in of.items() if page in files} == {"report"}

@@ -6,15 +6,15 @@ import ast
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pipeline.settings
-from pipeline.settings import Section
+import pipeline.core.settings
+from pipeline.core.settings import Section
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-ROOT = Path(pipeline.settings.__file__).parent
+ROOT = Path(pipeline.core.settings.__file__).parent
 JSON = ("Mapping[str, Any]", "dict[str, Any]", "JSON")
-SECTIONS = {n for n, kind in vars(pipeline.settings).items() if isinstance(kind, type) and issubclass(kind, Section)}
+SECTIONS = {n for n, kind in vars(pipeline.core.settings).items() if isinstance(kind, type) and issubclass(kind, Section)}
 # Modules and packages with functions that take JSON, by the reason.
 TAKE_JSON = {
     "the configuration, effects, profiles and simulations as files state them, before they are checked": (

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pipeline
-from pipeline.verdicts import Verdict, css_class
+from pipeline.core.verdicts import Verdict, css_class
 
 PACKAGE = Path(pipeline.__file__).parent
 ALSO_A_KEY = {Verdict.UNEXPLAINED}  # key of a diagnosis, kind of a chart

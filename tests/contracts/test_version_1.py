@@ -15,10 +15,10 @@ import pytest
 from jsonschema import Draft202012Validator
 
 import pipeline
-from pipeline.commands import add, apply, convert, explain
-from pipeline.config.campaign import load_campaign
-from pipeline.exports.reading import read_any
-from pipeline.records import READABLE_VERSIONS, SCHEMA_VERSION, SENSORS
+from pipeline.app.commands import add, apply, convert, explain
+from pipeline.app.config.campaign import load_campaign
+from pipeline.output.exports.reading import read_any
+from pipeline.core.records import READABLE_VERSIONS, SCHEMA_VERSION, SENSORS
 
 HERE, ROOT, UNIT = Path(__file__).parent, Path(__file__).parents[2], "mpu6050-2-hidden"
 DEVICE = 'overrides:\n  - "effects.gyroscope=[g_sensitivity]"\n'

@@ -28,8 +28,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from whole_run import run_jobs
 
 from pipeline.__main__ import main as command
-from pipeline.config import load_campaign
-from pipeline.pack import Pack
+from pipeline.app.config import load_campaign
+from pipeline.core.pack import Pack
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -17,11 +17,11 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import PipelineError
-from pipeline.records import SENSORS
-from pipeline.study.cases import FAMILIES, draw
-from pipeline.study.run import diagnose_case
-from pipeline.study.scores import wilson
+from pipeline.core.errors import PipelineError
+from pipeline.core.records import SENSORS
+from imu_research.study.cases import FAMILIES, draw
+from imu_research.study.run import diagnose_case
+from imu_research.study.scores import wilson
 
 if TYPE_CHECKING:
     from pipeline.unit import UnitState

@@ -25,8 +25,8 @@ from good_bench import BASES, good_unit
 from judged import OUTCOMES, SILENT, Judgement, judge, refused
 from unit_copy import TIME, Copy, NotApplicableError, write
 
-from pipeline.config import load_campaign
-from pipeline.errors import PipelineError
+from pipeline.app.config import load_campaign
+from pipeline.core.errors import PipelineError
 
 if TYPE_CHECKING:
     from collections.abc import Callable

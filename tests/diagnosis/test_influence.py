@@ -9,8 +9,8 @@ import pytest
 from bench_session import STOP_AND_GO, Session, record
 from unit_settings import settings_of
 
-from pipeline.diagnosis.influence import influence
-from pipeline.diagnosis.residual_dependence import goodness_of_fit
+from pipeline.evaluation.diagnosis.influence import influence
+from pipeline.evaluation.diagnosis.residual_dependence import goodness_of_fit
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe

@@ -11,16 +11,16 @@ import pytest
 from bench_session import BIAS, CONTINUOUS, STOP_AND_GO, Course, K, Session, record, values_of
 from unit_settings import filter_of, settings_of, with_noise
 
-from pipeline.diagnosis.words import in_words
+from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import fit_stage
-from pipeline.signal.filters import apply_filter
+from pipeline.physics.signal.filters import apply_filter
 from pipeline.simulation.description import shipped_settings
-from pipeline.validation.heldout import validate
+from pipeline.evaluation.held_out.heldout import validate
 from tests.published import diagnose
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.core.records import Recording, SensorCalibration
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 SHEET = shipped_settings(sensor="mpu6050").sensor

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.one_unit import unit_of_recordings
-from pipeline.records import SENSORS, Estimate, Recording, SensorCalibration, SensorDiagnosis
+from pipeline.app.one_unit import unit_of_recordings
+from pipeline.core.records import SENSORS, Estimate, Recording, SensorCalibration, SensorDiagnosis
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
-from pipeline.verdicts import Verdict
+from pipeline.core.verdicts import Verdict
 from tests.published import candidate, diagnose
 
 COURSE: dict[str, Any] = {

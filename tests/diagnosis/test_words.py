@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.diagnosis.findings import next_experiment
-from pipeline.diagnosis.words import PLUS_MINUS, in_words
+from pipeline.evaluation.diagnosis.findings import next_experiment
+from pipeline.evaluation.diagnosis.words import PLUS_MINUS, in_words
 from pipeline.estimation.posterior import Answers
-from pipeline.model.effects import catalogue
+from pipeline.physics.effects import catalogue
 from tests.published import candidate
 
 

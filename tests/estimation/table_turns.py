@@ -9,12 +9,12 @@ from scipy.signal import lfilter
 from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.stages import fit_stage
-from pipeline.records import Recording, SensorCalibration
+from pipeline.core.records import Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from pipeline.settings import Settings
+    from pipeline.core.settings import Settings
 
 INTERVAL = 0.12
 SHEETS = {

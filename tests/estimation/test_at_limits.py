@@ -10,8 +10,8 @@ from ferraris_session import FITS
 from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.reference_least_squares import fit as fit_on_table
-from pipeline.model.effects import effect
-from pipeline.records import BIAS, MATRIX, SensorCalibration, base_values
+from pipeline.physics.effects import effect
+from pipeline.core.records import BIAS, MATRIX, SensorCalibration, base_values
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 

@@ -11,9 +11,9 @@ from board_simulator import Chip, by_hand, draw_chip, felt, hand_board, table_bo
 from scipy.spatial.transform import Rotation
 from unit_settings import settings_of
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.chips import chip_document
-from pipeline.records import Recording, SensorCalibration
+from pipeline.core.records import Recording, SensorCalibration
 
 Q = Rotation.from_euler("zyx", [90, 3, -2], degrees=True).as_matrix()
 PLACE = np.array([0.03, -0.02, 0.01])

@@ -6,7 +6,7 @@ from unit_settings import settings_of
 
 from pipeline.estimation.observations import observe, weighted
 from pipeline.estimation.selection import select
-from pipeline.records import Noise, Recording
+from pipeline.core.records import Noise, Recording
 
 WHITE = 0.03  # deg/s
 NOISE = Noise(np.full(3, WHITE), np.full(3, 1e-3), 100.0, "static")

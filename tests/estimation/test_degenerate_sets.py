@@ -10,10 +10,10 @@ import pytest
 from unit_settings import settings_of, with_noise
 
 from pipeline import calibrate
-from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.records import Recording
+from pipeline.core.records import Recording
 
 if TYPE_CHECKING:
     from pathlib import Path

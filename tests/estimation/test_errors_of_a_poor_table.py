@@ -15,12 +15,12 @@ from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.reference_least_squares import fit
 from pipeline.estimation.stages import fit_stage
 from pipeline.estimation.table_errors import Reference, disturbance, table_errors
-from pipeline.model.kinematics import table_motion
+from pipeline.physics.kinematics import table_motion
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.core.records import Recording, SensorCalibration
 
 UNITS = 10
 COURSE = {"dwell_s": 1.2, "rates_dps": [60.0], "static_s": 0.0, "validation_s": 0.0}

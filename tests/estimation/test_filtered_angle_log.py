@@ -10,15 +10,15 @@ import pytest
 from bench_session import CONTINUOUS, STOP_AND_GO, WHITE, Session, record
 from unit_settings import filter_of, settings_of
 
-from pipeline.diagnosis.residual_dependence import dependences
+from pipeline.evaluation.diagnosis.residual_dependence import dependences
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
-from pipeline.signal.filters import apply_filter
+from pipeline.physics.signal.filters import apply_filter
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 SHEET = shipped_settings(sensor="mpu6050").sensor
 TABLE = settings_of().table

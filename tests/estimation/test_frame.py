@@ -5,9 +5,9 @@ import pytest
 from unit_settings import settings_of
 
 from pipeline.estimation.frame import frame_uncertainty
-from pipeline.model.calibration_file import OF_FRAME, beyond_uncertainty, frame_words
-from pipeline.model.kinematics import turn_by_vector
-from pipeline.records import FittedEffect, Recording, SensorCalibration
+from pipeline.physics.calibration_file import OF_FRAME, beyond_uncertainty, frame_words
+from pipeline.physics.kinematics import turn_by_vector
+from pipeline.core.records import FittedEffect, Recording, SensorCalibration
 
 NORMAL = 1.959964
 

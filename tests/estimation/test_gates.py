@@ -12,7 +12,7 @@ from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW, min_
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.ranking import Score
 from pipeline.estimation.selection import Selection
-from pipeline.model.effects import catalogue, effect
+from pipeline.physics.effects import catalogue, effect
 
 SLOW = {"bias_drift", "bias_temperature", "bias_temperature_quadratic", "warm_up"}
 OTHERS = {"scale_factor_temperature", "clock_rate", "time_offset", "quadratic_nonlinearity"}

@@ -11,7 +11,7 @@ from bench_session import BIAS, CONTINUOUS, ONE_WAY, SIZE, STOP_AND_GO, THESIS, 
 from scipy.special import stdtrit
 from unit_settings import settings_of, with_noise
 
-from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.design import EffectColumns, ordinary_base
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gauss_markov import Products, Setting, selection_grid
@@ -20,9 +20,9 @@ from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.ranking import Ranking
 from pipeline.estimation.selection import select
-from pipeline.model.effects import effect
-from pipeline.records import SensorCalibration
-from pipeline.signal.filters import apply_filter
+from pipeline.physics.effects import effect
+from pipeline.core.records import SensorCalibration
+from pipeline.physics.signal.filters import apply_filter
 from pipeline.simulation.description import shipped_settings
 
 SETTINGS = settings_of()

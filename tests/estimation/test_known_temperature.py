@@ -13,16 +13,16 @@ import pytest
 import yaml
 
 import pipeline
-from pipeline.commands import simulate
-from pipeline.errors import ConfigurationError
+from pipeline.app.commands import simulate
+from pipeline.core.errors import ConfigurationError
 from pipeline.estimation import known_temperature
-from pipeline.files import read_json
-from pipeline.settings import DataSheet, KnownTemperature
+from pipeline.core.files import read_json
+from pipeline.core.settings import DataSheet, KnownTemperature
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.result import UnitResult
+    from pipeline.app.result import UnitResult
 
 SENSORS = ("accelerometer", "gyroscope")
 TRUTH = {

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.least_squares import ScaledColumns, cholesky
 from tests.estimation.complex_step import jacobian_of, solve_linear, solve_nonlinear
 

@@ -15,14 +15,14 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.engine import ErrorMixture
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
-from pipeline.records import LIMIT, Budget, SensorCalibration
-from pipeline.report.pages import monte_carlo_of
+from pipeline.core.records import LIMIT, Budget, SensorCalibration
+from pipeline.output.pages.pages import monte_carlo_of
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 from tests.hand_session import hand_held
 
 if TYPE_CHECKING:
-    from pipeline.settings import Settings
+    from pipeline.core.settings import Settings
 
 PARAMETERS = 12
 

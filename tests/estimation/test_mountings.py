@@ -14,18 +14,18 @@ from unit_settings import settings_of
 
 from pipeline.estimation.effects import fit
 from pipeline.estimation.reference_least_squares import fit as fit_to_reference
-from pipeline.model.effects import effect, effect_of
-from pipeline.model.kinematics import reference_motion
-from pipeline.one_unit import unit_row
-from pipeline.preprocessing.mounting import check_mounting
-from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, UnitRecordings
+from pipeline.physics.effects import effect, effect_of
+from pipeline.physics.kinematics import reference_motion
+from pipeline.app.one_unit import unit_row
+from pipeline.checks.mounting import check_mounting
+from pipeline.core.records import FittedEffect, Noise, Recording, SensorCalibration, UnitRecordings
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "preprocessing"))
 from benches import BIAS, K, Setup, recordings_of
 from benches import settings_of as bench_settings
 
 if TYPE_CHECKING:
-    from pipeline.settings import Settings
+    from pipeline.core.settings import Settings
 
 TURNS = [(role, axis) for role in ("accelerometer", "gyroscope") for axis in "xyz"]
 SEAT_DEG = 2.0

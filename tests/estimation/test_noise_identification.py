@@ -24,7 +24,7 @@ from pipeline.estimation.noise_terms import (
     maximised,
     spectrum_of,
 )
-from pipeline.records import Recording
+from pipeline.core.records import Recording
 
 DT = 0.1
 Values = np.ndarray[Any, np.dtype[np.float64]]

@@ -8,14 +8,14 @@ import pytest
 from table_turns import Bench, run_stages, settings, specific_force
 from unit_settings import filter_of
 
-from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.reference_least_squares import fit
-from pipeline.model.kinematics import attitude_matrix, reference_motion
-from pipeline.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
-from pipeline.signal.filters import apply_filter
+from pipeline.physics.kinematics import attitude_matrix, reference_motion
+from pipeline.core.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
+from pipeline.physics.signal.filters import apply_filter
 
 if TYPE_CHECKING:
-    from pipeline.settings import Filter
+    from pipeline.core.settings import Filter
 
 K = np.eye(3) + np.array([[0.004, 0.011, -0.006], [-0.009, -0.012, 0.003], [0.007, -0.002, 0.018]])
 MATRIX = np.linalg.solve(K, np.eye(3))

@@ -5,8 +5,8 @@ import pytest
 from unit_settings import settings_of
 
 from pipeline.estimation.rest_means import held_out_rests, holdout_interval, rest_means, split_rests
-from pipeline.records import Recording
-from pipeline.signal.rests import Rest
+from pipeline.core.records import Recording
+from pipeline.physics.signal.rests import Rest
 
 PROCEDURE = settings_of(procedure={"holdout_every": 3}).procedure
 

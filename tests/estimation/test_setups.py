@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 from stage_files import load_recordings, save_recordings
 from unit_settings import settings_of
 
-from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.generalized_least_squares import fit_joint
-from pipeline.model.effects import effect
-from pipeline.model.effects.base import truth
-from pipeline.model.kinematics import reference_motion
+from pipeline.physics.effects import effect
+from pipeline.physics.effects.base import truth
+from pipeline.physics.kinematics import reference_motion
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 SETTINGS = settings_of()
 TILT = {"precise": np.array([0.02, -0.03]), "home": np.array([0.35, -0.2])}

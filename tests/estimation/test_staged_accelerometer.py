@@ -7,11 +7,11 @@ import pytest
 from table_turns import Bench, run_stages, settings, specific_force, stepped_angle
 from unit_settings import filter_of, with_noise
 
-from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
+from pipeline.core.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.stages import fit_stage
-from pipeline.records import SensorCalibration, StageResult, coverage_factor
-from pipeline.records.correction import Subtract, TwoSided, corrected
-from pipeline.signal.filters import apply_filter
+from pipeline.core.records import SensorCalibration, StageResult, coverage_factor
+from pipeline.core.records.correction import Subtract, TwoSided, corrected
+from pipeline.physics.signal.filters import apply_filter
 
 STAGES = ["orthogonality", "misalignment", "bias", "scale_factor"]
 BIAS = [0.049, -0.013, -0.127]  # MPU6050 (1), Sudsanguan 2019, table 5.2

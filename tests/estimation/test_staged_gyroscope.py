@@ -7,12 +7,12 @@ import pytest
 from table_turns import INTERVAL, Bench, ramped_rate, run_stages, settings
 from unit_settings import filter_of, with_noise
 
-from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
+from pipeline.core.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.stages import fit_stage
-from pipeline.model.kinematics import earth_rate
-from pipeline.records import SensorCalibration, StageResult, coverage_factor
-from pipeline.records.correction import Subtract, corrected
-from pipeline.signal.filters import apply_filter
+from pipeline.physics.kinematics import earth_rate
+from pipeline.core.records import SensorCalibration, StageResult, coverage_factor
+from pipeline.core.records.correction import Subtract, corrected
+from pipeline.physics.signal.filters import apply_filter
 
 STAGES = ["bias", "orthogonality_and_misalignment", "scale_factor"]
 BIAS = [-3.837, 0.003, 0.255]  # MPU6050 (1), Sudsanguan 2019, table 5.15

@@ -15,21 +15,21 @@ from unit_settings import settings_of, with_noise
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.stated_lines import with_stated
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
-from pipeline.io.arrow import to_parquet
-from pipeline.model.calibration_file import beyond_uncertainty
-from pipeline.preprocessing.reference_scale import rate_error
-from pipeline.records import FittedEffect, Noise, Note, UnitRecordings
-from pipeline.settings import Settings
-from pipeline.stages import batch
-from pipeline.stages.filter import filter_recordings
-from pipeline.stages.unit_files import FILES
+from pipeline.ingest.arrow import to_parquet
+from pipeline.physics.calibration_file import beyond_uncertainty
+from pipeline.checks.reference_scale import rate_error
+from pipeline.core.records import FittedEffect, Noise, Note, UnitRecordings
+from pipeline.core.settings import Settings
+from pipeline.app.steps import batch
+from pipeline.app.steps.filter import filter_recordings
+from pipeline.app.steps.unit_files import FILES
 from pipeline.unit import STEPS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.records import Recording, SensorCalibration
-    from pipeline.settings import Settings
+    from pipeline.core.records import Recording, SensorCalibration
+    from pipeline.core.settings import Settings
 
 K = np.diag([1.02, 0.99, 1.01])
 WARM = (20.0, 26.0)  # degC, from the first sample to the last of each recording

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from pipeline.model.effects import bench_priors
-from pipeline.one_unit import unit_of_recordings
-from pipeline.records import SensorCalibration
-from pipeline.settings import OF_BENCH, Table
+from pipeline.physics.effects import bench_priors
+from pipeline.app.one_unit import unit_of_recordings
+from pipeline.core.records import SensorCalibration
+from pipeline.core.settings import OF_BENCH, Table
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
-from pipeline.study.bench import recordings_of
-from pipeline.study.cases import draw
-from pipeline.study.run import diagnose_case
+from imu_research.study.bench import recordings_of
+from imu_research.study.cases import draw
+from imu_research.study.run import diagnose_case
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 COURSE: dict[str, Any] = {
     "validation_s": 40.0, "static_s": 30.0, "warm_up_rest_s": 15.0, "step_deg": 30.0, "dwell_s": 1.5,

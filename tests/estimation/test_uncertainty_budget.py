@@ -11,12 +11,12 @@ from table_turns import Bench, run_stages, settings, specific_force
 from unit_settings import settings_of
 
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
-from pipeline.records import coverage_factor
+from pipeline.core.records import coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.core.records import Recording, SensorCalibration
 
 K = np.eye(3) + np.array([[0.004, 0.011, -0.006], [-0.009, -0.012, 0.003], [0.007, -0.002, 0.018]])
 BIAS = [0.03, -0.02, 0.05]

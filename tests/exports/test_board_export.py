@@ -11,11 +11,11 @@ import yaml
 from scipy.spatial.transform import Rotation
 from test_formats import document, settings
 
-from pipeline.exports import exports
-from pipeline.exports.conversion import explain_board
+from pipeline.output.exports import exports
+from pipeline.output.exports.conversion import explain_board
 
 if TYPE_CHECKING:
-    from pipeline.settings import Settings
+    from pipeline.core.settings import Settings
 
 __all__ = ["settings"]
 PLACE = [0.03, -0.02, 0.01]

@@ -15,11 +15,11 @@ from unit_settings import settings_of
 
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_terms import allan_variance
-from pipeline.exports import ExportedUnit, export
-from pipeline.exports.conversion import document_of, with_noise
-from pipeline.exports.reading import read_any
-from pipeline.exports.sensors import INSTABILITY_FLOOR, SensorFigures, noise
-from pipeline.records import SENSORS, Recording, SensorCalibration
+from pipeline.output.exports import ExportedUnit, export
+from pipeline.output.exports.conversion import document_of, with_noise
+from pipeline.output.exports.reading import read_any
+from pipeline.output.exports.sensors import INSTABILITY_FLOOR, SensorFigures, noise
+from pipeline.core.records import SENSORS, Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,8 +16,8 @@ from sample_logs import make_recording
 from imu_logs import message_read as mcap
 from imu_logs.mcap_file import McapReader
 from imu_logs.profile import McapFormat
-from pipeline.errors import IngestError
-from pipeline.io.write import write_recording
+from pipeline.core.errors import IngestError
+from pipeline.ingest.write import write_recording
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

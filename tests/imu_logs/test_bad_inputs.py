@@ -15,16 +15,16 @@ from unit_settings import ingest_of, settings_of
 
 from imu_logs import text_lines as text_log
 from imu_logs.text_layout import TextLayout
-from pipeline.config.compose import check_ingest
-from pipeline.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.io.read import read_recordings
-from pipeline.model.calibration_file import left_out
-from pipeline.preprocessing.checks import check_recordings
-from pipeline.report.campaign_page import render
-from pipeline.stages.gather import same_files
+from pipeline.app.config.compose import check_ingest
+from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.ingest.read import read_recordings
+from pipeline.physics.calibration_file import left_out
+from pipeline.checks.checks import check_recordings
+from pipeline.output.pages.campaign_page import render
+from pipeline.app.steps.gather import same_files
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 CASES = cases()
 OF_LINES = ("05", "07", "08", "09", "10", "12", "13", "15", "17", "24", "25", "34", "35")

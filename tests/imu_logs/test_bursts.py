@@ -14,8 +14,8 @@ from unit_settings import ingest_of
 from imu_logs.clocks import find_bursts
 from imu_logs.message_read import read_log
 from imu_logs.profile import mcap_format
-from pipeline.errors import IngestError, InputError
-from pipeline.io.read import read_recordings
+from pipeline.core.errors import IngestError, InputError
+from pipeline.ingest.read import read_recordings
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,18 +13,18 @@ from unit_settings import ingest_of, settings_of
 
 from imu_logs.mcap_write import IMU, JOINT_STATE
 from imu_logs.profile import Checks
-from pipeline.errors import IngestError, InputError
-from pipeline.io.clock_alignment import align
-from pipeline.io.read import read_recordings, to_recording
-from pipeline.model.kinematics import reference_motion
-from pipeline.records import rate_of_attitude
-from pipeline.settings import RecordingFile
+from pipeline.core.errors import IngestError, InputError
+from pipeline.ingest.clock_alignment import align
+from pipeline.ingest.read import read_recordings, to_recording
+from pipeline.physics.kinematics import reference_motion
+from pipeline.core.records import rate_of_attitude
+from pipeline.core.settings import RecordingFile
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from imu_logs.log import Log
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 STANDARD_GRAVITY = 9.80665
 

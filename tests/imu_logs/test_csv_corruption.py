@@ -19,14 +19,14 @@ from hypothesis import strategies as st
 from sample_logs import SENSOR, procedure, profile
 from unit_settings import ingest_of
 
-from pipeline.errors import InputError
-from pipeline.io.read import read_recordings
+from pipeline.core.errors import InputError
+from pipeline.ingest.read import read_recordings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 CANONICAL = profile("canonical_csv")
 COUNT = 150

@@ -16,10 +16,10 @@ from unit_settings import ingest_of, sheet_of
 
 from imu_logs.profile import csv_formats
 from imu_logs.text_read import read_csv
-from pipeline.errors import IngestError
-from pipeline.io.read import read_recordings
-from pipeline.io.write import write_recording
-from pipeline.records import Recording
+from pipeline.core.errors import IngestError
+from pipeline.ingest.read import read_recordings
+from pipeline.ingest.write import write_recording
+from pipeline.core.records import Recording
 
 if TYPE_CHECKING:
     from pathlib import Path

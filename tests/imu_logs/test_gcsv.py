@@ -9,13 +9,13 @@ import pytest
 from sample_logs import SENSOR, procedure
 from unit_settings import ingest_of
 
-from pipeline.errors import IngestError
-from pipeline.io.read import read_recordings
+from pipeline.core.errors import IngestError
+from pipeline.ingest.read import read_recordings
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 HEAD = {"version": "1.3", "orientation": "XYZ", "tscale": "0.001", "gscale": "0.00122173047", "ascale": "0.00048828125"}
 ROWS = "0,39,86,183,-114,-1569,-299\n10,40,87,184,-113,-1568,-298\n20,41,88,185,-112,-1567,-297\n"

@@ -10,7 +10,7 @@ import pytest
 from damaged_logs import RECORDERS, Tally, cuts, flips, log_of, messages_of, read_messages, same_bits, table_of
 from mcap.writer import Writer
 
-from pipeline.errors import IngestError
+from pipeline.core.errors import IngestError
 
 if TYPE_CHECKING:
     from pathlib import Path

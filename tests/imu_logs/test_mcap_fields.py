@@ -17,8 +17,8 @@ from unit_settings import ingest_of
 from imu_logs.mcap_write import DEFINITIONS, IMU
 from imu_logs.message_read import read_log
 from imu_logs.profile import mcap_format
-from pipeline.errors import ConfigurationError, IngestError
-from pipeline.io.read import read_recordings
+from pipeline.core.errors import ConfigurationError, IngestError
+from pipeline.ingest.read import read_recordings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -18,15 +18,15 @@ from unit_settings import ingest_of
 
 from imu_logs.mcap_file import McapReader
 from imu_logs.mcap_write import DEFINITIONS, IMU, JOINT_STATE, TEMPERATURE
-from pipeline.errors import InputError
-from pipeline.io.read import read_recordings
-from pipeline.io.write import write_recording
+from pipeline.core.errors import InputError
+from pipeline.ingest.read import read_recordings
+from pipeline.ingest.write import write_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 
 def read(folder: Path, **mcap: Any) -> Recording:

@@ -15,7 +15,7 @@ from unit_settings import ingest_of
 from imu_logs.clocks import of_number
 from imu_logs.message_read import read_log
 from imu_logs.profile import mcap_format
-from pipeline.errors import IngestError
+from pipeline.core.errors import IngestError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

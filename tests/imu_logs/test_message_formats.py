@@ -31,13 +31,13 @@ from unit_settings import ingest_of
 from imu_logs.files import MESSAGE_FORMATS
 from imu_logs.message_read import read_log
 from imu_logs.profile import mcap_format
-from pipeline.commands.apply import main as apply
-from pipeline.commands.check import main as check
-from pipeline.config.compose import check_ingest
-from pipeline.errors import ConfigurationError, IngestError, InputError
-from pipeline.files import CONFIGS
-from pipeline.io.read import read_recordings
-from pipeline.records import SensorCalibration
+from pipeline.app.commands.apply import main as apply
+from pipeline.app.commands.check import main as check
+from pipeline.app.config.compose import check_ingest
+from pipeline.core.errors import ConfigurationError, IngestError, InputError
+from pipeline.core.files import CONFIGS
+from pipeline.ingest.read import read_recordings
+from pipeline.core.records import SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Callable

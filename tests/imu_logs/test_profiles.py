@@ -12,9 +12,9 @@ from sample_logs import procedure, profile
 from unit_settings import ingest_of
 
 from imu_logs.profile import csv_formats, mcap_format
-from pipeline.config.compose import Composer, check_ingest
-from pipeline.errors import ConfigurationError
-from pipeline.io.files import candidate_files
+from pipeline.app.config.compose import Composer, check_ingest
+from pipeline.core.errors import ConfigurationError
+from pipeline.ingest.files import candidate_files
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -62,7 +62,7 @@ def test_counts_of_the_arduino_profile_follow_the_sensor(tmp_path: Path) -> None
 
 def test_file_names_need_only_the_standard_library() -> None:
     code = (
-        "import sys, pipeline.io.files as f; from pathlib import Path; from types import SimpleNamespace as S;"
+        "import sys, pipeline.ingest.files as f; from pathlib import Path; from types import SimpleNamespace as S;"
         "f.recording_files(S(recordings={'a': S(file='a', optional=False)}), S(csv={}, mcap={}), Path('.'));"
         "print([m for m in ('numpy', 'pyarrow', 'mcap', 'yaml', 'omegaconf', 'pydantic') if m in sys.modules])"
     )
@@ -72,7 +72,7 @@ def test_file_names_need_only_the_standard_library() -> None:
 
 def test_a_log_of_messages_is_read_without_the_library_for_text() -> None:
     code = (
-        "import sys, pipeline.io.read, imu_logs.message_read;"
+        "import sys, pipeline.ingest.read, imu_logs.message_read;"
         "print([m for m in ('pyarrow', 'scipy', 'yaml', 'omegaconf') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -11,17 +11,17 @@ import pytest
 from sample_logs import SENSOR, make_recording, procedure, profile
 from unit_settings import ingest_of
 
-from pipeline.config.compose import check_ingest
-from pipeline.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.io.files import recording_files
-from pipeline.io.read import read_recordings
-from pipeline.io.write import write_recording
+from pipeline.app.config.compose import check_ingest
+from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.ingest.files import recording_files
+from pipeline.ingest.read import read_recordings
+from pipeline.ingest.write import write_recording
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.records import Recording
-    from pipeline.settings import Sensor
+    from pipeline.core.records import Recording
+    from pipeline.core.settings import Sensor
 
 HEADER = "time_s,accel_x_g,accel_y_g,accel_z_g,gyro_x_dps,gyro_y_dps,gyro_z_dps"
 ROWS = [f"{i / 100:.2f},0.01,0.02,1.0{i},0.1,0.2,0.3" for i in range(8)]

@@ -11,7 +11,7 @@ from unit_settings import ingest_of
 
 from imu_logs.message_read import read_log
 from imu_logs.profile import mcap_format
-from pipeline.errors import IngestError
+from pipeline.core.errors import IngestError
 
 if TYPE_CHECKING:
     from pathlib import Path

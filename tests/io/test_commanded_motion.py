@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from simulated_logs import as_table
 
-from pipeline.errors import IngestError
-from pipeline.io.commanded_motion import Program, follow_program
-from pipeline.records import Recording
+from pipeline.core.errors import IngestError
+from pipeline.ingest.commanded_motion import Program, follow_program
+from pipeline.core.records import Recording
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.session import Streams, as_program
 from pipeline.simulation.trajectory import CommandedTurns, rest, turn

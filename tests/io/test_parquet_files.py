@@ -17,9 +17,9 @@ from sample_logs import SENSOR, assert_same_bits, make_recording, procedure, pro
 from stage_files import load_recordings, save_recordings
 from unit_settings import ingest_of
 
-from pipeline.errors import InputError
-from pipeline.io.read import read_recordings
-from pipeline.records import Note, Recording
+from pipeline.core.errors import InputError
+from pipeline.ingest.read import read_recordings
+from pipeline.core.records import Note, Recording
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.errors import IngestError, MissingInputError
-from pipeline.io.recordings_sheet import direction_of, read_sheet
+from pipeline.core.errors import IngestError, MissingInputError
+from pipeline.ingest.recordings_sheet import direction_of, read_sheet
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,8 +10,8 @@ from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Session, record, values
 from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.stages import fit_stage
-from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
-from pipeline.records import Note, Recording
+from pipeline.ingest.disturbances import leave_out_disturbances, leave_out_shaken_rests
+from pipeline.core.records import Note, Recording
 
 SETTINGS = settings_of(sensor={"accelerometer": {"bias_wander": 1e-4, "cross_axis": 0.02}})
 METHODS = {"reference": "reference_least_squares", "magnitude": "nonlinear_least_squares"}

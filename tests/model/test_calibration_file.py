@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from pipeline.io.quality_flags import CLIPPED
-from pipeline.model.calibration_file import implausible, sample_covariance, sentences
-from pipeline.records import FittedEffect, Recording, SensorCalibration
+from pipeline.ingest.quality_flags import CLIPPED
+from pipeline.physics.calibration_file import implausible, sample_covariance, sentences
+from pipeline.core.records import FittedEffect, Recording, SensorCalibration
 from pipeline.simulation.description import shipped_settings
-from pipeline.stages.calibration import calibrated_range, judged
+from pipeline.app.steps.calibration import calibrated_range, judged
 
 if TYPE_CHECKING:
-    from pipeline.settings import DataSheet
+    from pipeline.core.settings import DataSheet
 
 CONFIGS = Path(__file__).parents[2] / "configs/sensor"
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from bench_session import random_motion
 
-from pipeline.model.effects import built_in
+from pipeline.physics.effects import built_in
 
 STORED = np.load(Path(__file__).parent / "data" / "columns_of_effects.npz")
 CASES = sorted({tuple(key.split(".")[:3]) for key in STORED.files if key.endswith(".columns")})

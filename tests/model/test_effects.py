@@ -9,12 +9,12 @@ import pytest
 from bench_session import K, Session, record
 from scipy.spatial.transform import Rotation
 
-from pipeline.errors import ConfigurationError, InputError
-from pipeline.model.effects import effect
-from pipeline.model.effects.base import parameter_limits, turning_direction
-from pipeline.model.kinematics import reference_motion
-from pipeline.model.measurement import predicted_reading
-from pipeline.records import FittedEffect, Motion, Recording, SensorCalibration
+from pipeline.core.errors import ConfigurationError, InputError
+from pipeline.physics.effects import effect
+from pipeline.physics.effects.base import parameter_limits, turning_direction
+from pipeline.physics.kinematics import reference_motion
+from pipeline.physics.measurement import predicted_reading
+from pipeline.core.records import FittedEffect, Motion, Recording, SensorCalibration
 
 ONE = np.eye(3)
 

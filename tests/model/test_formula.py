@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ConfigurationError
-from pipeline.model.formula import FUNCTIONS, SIGNALS, Formula, parse
+from pipeline.core.errors import ConfigurationError
+from pipeline.physics.formula import FUNCTIONS, SIGNALS, Formula, parse
 
 if TYPE_CHECKING:
     from pathlib import Path

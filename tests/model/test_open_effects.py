@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.model.open_effects import both_figures, open_words, with_open
-from pipeline.records import Budget, NotIncluded, SensorCalibration
+from pipeline.physics.open_effects import both_figures, open_words, with_open
+from pipeline.core.records import Budget, NotIncluded, SensorCalibration
 
 U_BIAS = 1e-3 * 1.959964
 CALIBRATION = SensorCalibration(
@@ -52,7 +52,7 @@ def test_without_a_diagnosis_every_effect_is_open() -> None:
 
 
 def test_a_fitted_effect_is_not_open() -> None:
-    from pipeline.records import FittedEffect  # noqa: PLC0415
+    from pipeline.core.records import FittedEffect  # noqa: PLC0415
 
     effect = FittedEffect("cubic_nonlinearity", {})
     found = with_open("accelerometer", replace(CALIBRATION, effects=(effect,)), HIDDEN)

@@ -16,9 +16,9 @@ from bench_session import CONTINUOUS, STOP_AND_GO, K, Session, record
 from unit_settings import settings_of
 
 from pipeline import load_calibration
-from pipeline.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.estimation.generalized_least_squares import fit_joint
-from pipeline.model.effects import (
+from pipeline.physics.effects import (
     built_in,
     catalogue,
     effect,
@@ -30,11 +30,11 @@ from pipeline.model.effects import (
     register,
     register_user_effects,
 )
-from pipeline.model.effects.base import Layout, parameter_limits
-from pipeline.model.formula import FUNCTIONS, SIGNALS
-from pipeline.model.kinematics import reference_motion
-from pipeline.records import FittedEffect, Motion, Recording, SensorCalibration
-from pipeline.settings import UserEffectFiles
+from pipeline.physics.effects.base import Layout, parameter_limits
+from pipeline.physics.formula import FUNCTIONS, SIGNALS
+from pipeline.physics.kinematics import reference_motion
+from pipeline.core.records import FittedEffect, Motion, Recording, SensorCalibration
+from pipeline.core.settings import UserEffectFiles
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -304,7 +304,7 @@ def test_a_calibration_with_a_harmful_definition_is_refused(tmp_path: Path) -> N
 
 PYTHON = """\
 import numpy as np
-from pipeline.model.effects.base import Effect, Layout, Owner, axis_parameters
+from pipeline.physics.effects.base import Effect, Layout, Owner, axis_parameters
 
 
 class LoosePart(Effect):

@@ -14,10 +14,10 @@ from pipeline.estimation.gauss_markov import Blocks, Setting, selection_grid
 from pipeline.estimation.observations import observe
 from pipeline.estimation.ranking import Ranking
 from pipeline.estimation.selection import select
-from pipeline.model.effects import catalogue, effect
-from pipeline.planning.detection_limits import noise_sums
-from pipeline.planning.plan import FAULTLESS, ROOM, plan_of, stated_noise
-from pipeline.records import SENSORS
+from pipeline.physics.effects import catalogue, effect
+from pipeline.app.planning.detection_limits import noise_sums
+from pipeline.app.planning.plan import FAULTLESS, ROOM, plan_of, stated_noise
+from pipeline.core.records import SENSORS
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
 

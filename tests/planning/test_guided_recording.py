@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from unit_settings import with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.planning.guide import (
+from pipeline.app.planning.guide import (
     TURNS_DEG,
     GuideProgress,
     ProposedTurn,
@@ -23,16 +23,16 @@ from pipeline.planning.guide import (
     most_informative_turn,
     propose,
 )
-from pipeline.planning.guide import (
+from pipeline.app.planning.guide import (
     progress_of as progress_of_unit,
 )
-from pipeline.records import Recording, SensorCalibration
+from pipeline.core.records import Recording, SensorCalibration
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.settings import Settings
+    from pipeline.core.settings import Settings
 
 SHIPPED = shipped_settings(sensor="mpu6050", table="hand", procedure="multi_position")
 SETTINGS = SHIPPED.replaced(procedure=SHIPPED.procedure.replaced(holdout_every=0))

@@ -14,7 +14,7 @@ from pipeline.simulation.description import UnitDescription, shipped_settings
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
     Unit = list[Recording]
     Change = Callable[[Unit], Unit]

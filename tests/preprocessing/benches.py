@@ -9,9 +9,9 @@ import numpy as np
 import unit_settings
 from scipy.spatial.transform import Rotation
 
-from pipeline.preprocessing.bench import signed_axis
-from pipeline.records import Recording
-from pipeline.settings import RecordingFile, Settings
+from pipeline.checks.bench import signed_axis
+from pipeline.core.records import Recording
+from pipeline.core.settings import RecordingFile, Settings
 
 INTERVAL_S = 0.12
 BIAS = {"accelerometer": np.array([0.03, -0.02, 0.05]), "gyroscope": np.array([1.2, -0.8, 0.5])}

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.preprocessing.coarse_temperature import refined
-from pipeline.records import Recording
-from pipeline.signal.filters import temperature_of
+from pipeline.checks.coarse_temperature import refined
+from pipeline.core.records import Recording
+from pipeline.physics.signal.filters import temperature_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -13,12 +13,12 @@ from benches import BIAS, INTERVAL_S, RATE, Setup, entry_of, recordings_of, sett
 from benches import K as TRUE_K
 from scipy.spatial.transform import Rotation
 
-from pipeline.errors import IngestError
+from pipeline.core.errors import IngestError
 from pipeline.estimation.reference_least_squares import fit
-from pipeline.model.kinematics import reference_motion
-from pipeline.preprocessing.checks import check_recordings
-from pipeline.preprocessing.mounting import check_mounting, words
-from pipeline.records import Recording
+from pipeline.physics.kinematics import reference_motion
+from pipeline.checks.checks import check_recordings
+from pipeline.checks.mounting import check_mounting, words
+from pipeline.core.records import Recording
 
 LEVEL = [
     (a, s + u) for a in "xyz" for u in "xyz" for s in "+-" if u != a
@@ -303,7 +303,7 @@ def test_a_slow_turn_is_followed_although_the_bias_is_as_large_as_its_rate(rate_
 
 
 def test_a_bench_is_told_in_words() -> None:
-    from pipeline.preprocessing.bench import TurnMounting  # noqa: PLC0415
+    from pipeline.checks.bench import TurnMounting  # noqa: PLC0415
 
     assert words(TurnMounting("x", "-y", -1, 37.04)) == (
         "body -y up at a table angle of 37.0 deg, the angle counted left-handed about x"

@@ -10,13 +10,13 @@ import pytest
 from benches import Setup, recordings_of, settings_of
 from scipy.spatial.transform import Rotation
 
-from pipeline.preprocessing.bench import fit_turn, signed_axis
-from pipeline.preprocessing.mounting import check_mounting
-from pipeline.study.bench import recordings_of as recordings_of_case
-from pipeline.study.cases import FAMILIES, draw
+from pipeline.checks.bench import fit_turn, signed_axis
+from pipeline.checks.mounting import check_mounting
+from imu_research.study.bench import recordings_of as recordings_of_case
+from imu_research.study.cases import FAMILIES, draw
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 
 def doubted(recordings: list[Recording]) -> dict[str, str]:

@@ -15,9 +15,9 @@ from imu_logs.columns import find_layout
 from imu_logs.profile import Checks, csv_formats
 from imu_logs.proposal import Proposal, as_yaml
 from imu_logs.text_read import read_csv
-from pipeline.config.compose import Composer
-from pipeline.errors import IngestError
-from pipeline.profile_detection.unit_guesses import propose
+from pipeline.app.config.compose import Composer
+from pipeline.core.errors import IngestError
+from pipeline.app.profile_detection.unit_guesses import propose
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "data"
 

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigurationError
-from pipeline.records.correction import CorrectionStep, TwoSided, corrected, published, steps_of
+from pipeline.core.errors import ConfigurationError
+from pipeline.core.records.correction import CorrectionStep, TwoSided, corrected, published, steps_of
 
 
 def read(correction: dict[str, Any]) -> tuple[CorrectionStep, ...]:

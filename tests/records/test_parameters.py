@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pipeline
-from pipeline.records import (
+from pipeline.core.records import (
     AFTER_BASE,
     BASE,
     BASE_NAMES,

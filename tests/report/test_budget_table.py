@@ -11,9 +11,9 @@ import pytest
 from pipeline.estimation.least_squares import convergence_evidence
 from pipeline.estimation.table_errors import type_b
 from pipeline.estimation.uncertainty_budget import combined, scatter_contribution
-from pipeline.records import SensorCalibration
-from pipeline.report.pages import template
-from pipeline.report.unit_page import render
+from pipeline.core.records import SensorCalibration
+from pipeline.output.pages.pages import template
+from pipeline.output.pages.unit_page import render
 
 from .test_pages import Text
 

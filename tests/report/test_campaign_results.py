@@ -15,12 +15,12 @@ import pandas as pd
 import pytest
 
 import pipeline
-from pipeline.errors import InputError, MissingInputError
+from pipeline.core.errors import InputError, MissingInputError
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.outcome import read_summary
-from pipeline.records import Recording
-from pipeline.report.fleet import write_summary
-from pipeline.report.parameters import summary_row
+from pipeline.output.outcome import read_summary
+from pipeline.core.records import Recording
+from pipeline.output.pages.fleet import write_summary
+from pipeline.output.pages.parameters import summary_row
 
 from .conftest import Unit, build_unit
 

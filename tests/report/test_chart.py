@@ -8,9 +8,9 @@ from base64 import b64decode
 import numpy as np
 import pytest
 
-from pipeline.report.axis import Axis, log_ticks, round_ticks, tick_label
-from pipeline.report.chart import Area, Dots, Figure, Panel, SampleMarks, chart
-from pipeline.report.numbers import measured, number, span, typeset
+from pipeline.output.pages.axis import Axis, log_ticks, round_ticks, tick_label
+from pipeline.output.pages.chart import Area, Dots, Figure, Panel, SampleMarks, chart
+from pipeline.output.pages.numbers import measured, number, span, typeset
 
 FIGURE = Figure("n", "t")
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from pipeline.records import Budget, Contribution, SensorCalibration
-from pipeline.report.combined import combined_calibrations, repeatability
+from pipeline.core.records import Budget, Contribution, SensorCalibration
+from pipeline.output.pages.combined import combined_calibrations, repeatability
 
 TRUTH = np.concatenate([[0.02, -0.01, 0.03], np.eye(3).ravel()])
 OWN_U, BENCH_U = 1e-4, 5e-5

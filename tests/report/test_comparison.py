@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from pipeline.report.campaign_page import render
-from pipeline.report.comparison import (
+from pipeline.output.pages.campaign_page import render
+from pipeline.output.pages.comparison import (
     adjusted,
     against_truth,
     compare,
@@ -20,8 +20,8 @@ from pipeline.report.comparison import (
     section,
     unit_figures,
 )
-from pipeline.report.numbers import number
-from pipeline.report.parameters import Parameter
+from pipeline.output.pages.numbers import number
+from pipeline.output.pages.parameters import Parameter
 
 from .conftest import build_unit
 

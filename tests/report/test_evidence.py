@@ -11,14 +11,14 @@ import pytest
 from unit_settings import sheet_of
 
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.records import Recording
-from pipeline.report.axis import scaled
-from pipeline.report.diagnosis_section import _column_unit, added_variable, ranking, unexplained
-from pipeline.report.held_out_section import error_steps
-from pipeline.report.noise_section import allan, remarks, term_rows
-from pipeline.report.numbers import Scale, number
-from pipeline.report.residual_section import harmonic_noise, harmonics, residual_figures, residuals
-from pipeline.report.unit_page import render
+from pipeline.core.records import Recording
+from pipeline.output.pages.axis import scaled
+from pipeline.output.pages.diagnosis_section import _column_unit, added_variable, ranking, unexplained
+from pipeline.output.pages.held_out_section import error_steps
+from pipeline.output.pages.noise_section import allan, remarks, term_rows
+from pipeline.output.pages.numbers import Scale, number
+from pipeline.output.pages.residual_section import harmonic_noise, harmonics, residual_figures, residuals
+from pipeline.output.pages.unit_page import render
 
 from .conftest import SIGMA, Unit, build_unit, diagnosis_of
 

@@ -6,11 +6,11 @@ from pathlib import Path
 from hand_session import hand_held
 from stage_files import documents, write_pack
 
-from pipeline.config.compose import Composer
-from pipeline.io.arrow import to_parquet
-from pipeline.pack import Pack
-from pipeline.settings import Stated
-from pipeline.stages import batch
+from pipeline.app.config.compose import Composer
+from pipeline.ingest.arrow import to_parquet
+from pipeline.core.pack import Pack
+from pipeline.core.settings import Stated
+from pipeline.app.steps import batch
 from pipeline.unit import STEPS
 
 

@@ -12,8 +12,8 @@ import pytest
 from scipy import stats
 from unit_settings import settings_of
 
-from pipeline.report.fleet import _missing_effects, fleet_statistics, parameter_table, write_parameters
-from pipeline.report.parameters import unit_parameters
+from pipeline.output.pages.fleet import _missing_effects, fleet_statistics, parameter_table, write_parameters
+from pipeline.output.pages.parameters import unit_parameters
 
 if TYPE_CHECKING:
     from pathlib import Path

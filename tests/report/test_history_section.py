@@ -4,8 +4,8 @@ import re
 from html import unescape
 from typing import Any
 
-from pipeline.report import unit_page
-from pipeline.report.run_section import LINK_MARK, MARK, runs_data, with_history
+from pipeline.output.pages import unit_page
+from pipeline.output.pages.run_section import LINK_MARK, MARK, runs_data, with_history
 
 from .conftest import Unit
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.records import Budget, Contribution, FittedEffect, SensorCalibration
-from pipeline.report.combined import calibration_with_prior, estimates, priors_of
+from pipeline.core.records import Budget, Contribution, FittedEffect, SensorCalibration
+from pipeline.output.pages.combined import calibration_with_prior, estimates, priors_of
 
 TRUTH = np.concatenate([[0.02, -0.01, 0.03], np.eye(3).ravel()])
 OWN_U, BENCH_U, TAU = 1e-4, 3e-4, 1e-4

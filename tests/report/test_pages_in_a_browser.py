@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from pipeline.report import campaign_page, unit_page
-from pipeline.report.chart import Figure, LineMark, Panel, SampleMarks, chart
-from pipeline.report.pages import asset
-from pipeline.report.run_section import runs_data
+from pipeline.output.pages import campaign_page, unit_page
+from pipeline.output.pages.chart import Figure, LineMark, Panel, SampleMarks, chart
+from pipeline.output.pages.pages import asset
+from pipeline.output.pages.run_section import runs_data
 
 from .conftest import build_unit
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.records import Recording
-from pipeline.report.unit_page import recording_rows
+from pipeline.core.records import Recording
+from pipeline.output.pages.unit_page import recording_rows
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from unit_settings import settings_of
 
-from pipeline.report.residual_section import _binned_mean, harmonics, residuals
-from pipeline.signal.filters import apply_filter
+from pipeline.output.pages.residual_section import _binned_mean, harmonics, residuals
+from pipeline.physics.signal.filters import apply_filter
 
 from .conftest import EFFECT, SIGMA, Unit, build_unit
 

@@ -9,18 +9,18 @@ import pytest
 
 from pipeline import diagnosis as diagnosis_package
 from pipeline import report as report_package
-from pipeline.commands.explain import explain
-from pipeline.diagnosis.words import in_words
-from pipeline.files import write_json
-from pipeline.outcome import counted
-from pipeline.records import SENSORS
-from pipeline.report import campaign_page
-from pipeline.report.chart import Figure
-from pipeline.report.diagnosis_section import limit_rows
-from pipeline.report.group_charts import Point, bars
-from pipeline.report.parameters import summary_row
-from pipeline.report.unit_page import render
-from pipeline.verdicts import error_in_row, error_of, kinds_of, problems
+from pipeline.app.commands.explain import explain
+from pipeline.evaluation.diagnosis.words import in_words
+from pipeline.core.files import write_json
+from pipeline.output.outcome import counted
+from pipeline.core.records import SENSORS
+from pipeline.output.pages import campaign_page
+from pipeline.output.pages.chart import Figure
+from pipeline.output.pages.diagnosis_section import limit_rows
+from pipeline.output.pages.group_charts import Point, bars
+from pipeline.output.pages.parameters import summary_row
+from pipeline.output.pages.unit_page import render
+from pipeline.core.verdicts import error_in_row, error_of, kinds_of, problems
 
 from .conftest import SHEET, Unit, build_unit
 from .test_pages import Text

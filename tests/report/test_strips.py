@@ -10,10 +10,10 @@ import pytest
 from scipy.linalg import polar
 from unit_settings import settings_of
 
-from pipeline.model.calibration_file import beyond_limits
-from pipeline.report.campaign_page import ENDS, strips
-from pipeline.report.fleet import parameter_table
-from pipeline.report.parameters import unit_parameters
+from pipeline.physics.calibration_file import beyond_limits
+from pipeline.output.pages.campaign_page import ENDS, strips
+from pipeline.output.pages.fleet import parameter_table
+from pipeline.output.pages.parameters import unit_parameters
 
 if TYPE_CHECKING:
     import pandas as pd

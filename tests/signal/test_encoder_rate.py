@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid
 
-from pipeline.records import Recording
-from pipeline.signal.encoder_rate import EncoderRate, rate_by_angle
+from pipeline.core.records import Recording
+from pipeline.physics.signal.encoder_rate import EncoderRate, rate_by_angle
 
 INTERVAL = 0.01
 

@@ -10,9 +10,9 @@ import pytest
 import yaml
 from unit_settings import filter_of
 
-from pipeline.errors import ConfigurationError, InputError
-from pipeline.records import Recording
-from pipeline.signal.filters import apply_filter, smooth_temperature
+from pipeline.core.errors import ConfigurationError, InputError
+from pipeline.core.records import Recording
+from pipeline.physics.signal.filters import apply_filter, smooth_temperature
 
 CONFIGS = Path(__file__).parents[2] / "configs/filter"
 FILTERS = ["rc_low_pass", "low_pass", "high_pass", "band_pass", "band_stop"]

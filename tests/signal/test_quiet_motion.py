@@ -12,9 +12,9 @@ from unit_settings import with_noise
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
-from pipeline.records import Recording
-from pipeline.signal.quiet_motion import creep_of_readings, posterior_creep_rates
-from pipeline.signal.rests import Rest, find_rests
+from pipeline.core.records import Recording
+from pipeline.physics.signal.quiet_motion import creep_of_readings, posterior_creep_rates
+from pipeline.physics.signal.rests import Rest, find_rests
 from tests.published import validate
 
 QUIET = {"accelerometer": 3e-4, "gyroscope": 0.01}  # white noise of a sample, g and deg/s

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hand_simulator import Hand, draw
 
-from pipeline.records import Recording
-from pipeline.signal.rests import Rest, assess_rests, find_rests, rests_from_table, runs, still_samples
+from pipeline.core.records import Recording
+from pipeline.physics.signal.rests import Rest, assess_rests, find_rests, rests_from_table, runs, still_samples
 
 DATA = Path(__file__).parents[2] / "../shared/data"
 needs_data = pytest.mark.skipif(not DATA.exists(), reason="reference data not beside the repository")

@@ -11,19 +11,19 @@ import pytest
 
 from imu_logs.log import Log
 from imu_logs.profile import Checks
-from pipeline.errors import InputError
-from pipeline.io.encoder_log import unwrapped
-from pipeline.io.read import to_recording
-from pipeline.records import rate_of_attitude
-from pipeline.settings import RecordingFile, Window
-from pipeline.signal.segments import cut
+from pipeline.core.errors import InputError
+from pipeline.ingest.encoder_log import unwrapped
+from pipeline.ingest.read import to_recording
+from pipeline.core.records import rate_of_attitude
+from pipeline.core.settings import RecordingFile, Window
+from pipeline.physics.signal.segments import cut
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, course_of
 from pipeline.simulation.procedures import TRANSIT, plan
 from pipeline.simulation.session import Streams
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 COURSE = {"step_deg": 30.0, "dwell_s": 2.0, "validation_s": 60.0, "static_s": 90.0, "pause_s": 10.0}
 TURNS = ["accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z"]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.commands.simulate import main
-from pipeline.errors import ConfigurationError
-from pipeline.model.effects import catalogue, effect_from, forget, register
+from pipeline.app.commands.simulate import main
+from pipeline.core.errors import ConfigurationError
+from pipeline.physics.effects import catalogue, effect_from, forget, register
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.errors import ConfigurationError
-from pipeline.io.commanded_motion import Program, _flat
-from pipeline.records import rate_of_attitude
+from pipeline.core.errors import ConfigurationError
+from pipeline.ingest.commanded_motion import Program, _flat
+from pipeline.core.records import rate_of_attitude
 from pipeline.simulation.campaign import simulate_unit, write_campaign
 from pipeline.simulation.description import UnitDescription, description_from
 from pipeline.simulation.procedures import Course, plan
@@ -21,7 +21,7 @@ from pipeline.simulation.trajectory import CommandedTurns
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 SHORT = {"step_deg": 30.0, "validation_s": 30.0, "static_s": 20.0}
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.io.commanded_motion import Program
-from pipeline.model.effects import catalogue, effect
-from pipeline.model.effects.base import Owner, truth
-from pipeline.model.effects.formula_effect import FormulaEffect
-from pipeline.model.kinematics import earth_rate
+from pipeline.ingest.commanded_motion import Program
+from pipeline.physics.effects import catalogue, effect
+from pipeline.physics.effects.base import Owner, truth
+from pipeline.physics.effects.formula_effect import FormulaEffect
+from pipeline.physics.kinematics import earth_rate
 from pipeline.simulation.description import shipped_settings
 from pipeline.simulation.sensor import (
     ALTERATIONS,
@@ -33,7 +33,7 @@ from pipeline.simulation.trajectory import (
 )
 
 if TYPE_CHECKING:
-    from pipeline.records import Motion
+    from pipeline.core.records import Motion
 
 SIZES = {
     "lever_arm": 0.05, "time_offset": 1e-4, "clock_rate": 1.0, "low_pass_lag": 1e-4, "earth_rotation": 4e-3,

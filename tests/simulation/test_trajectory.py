@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.io.commanded_motion import Program
-from pipeline.model.kinematics import UP_AT_ZERO, attitude_matrix, turn_about_axis
+from pipeline.ingest.commanded_motion import Program
+from pipeline.physics.kinematics import UP_AT_ZERO, attitude_matrix, turn_about_axis
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.trajectory import (
     CommandedTurns,

@@ -8,12 +8,12 @@ import numpy as np
 from board_simulator import by_hand, draw_chip, hand_board
 from stage_files import write_pack
 
-from pipeline.io.arrow import to_parquet
-from pipeline.pack import FAILED, Pack
-from pipeline.settings import Board
+from pipeline.ingest.arrow import to_parquet
+from pipeline.core.pack import FAILED, Pack
+from pipeline.core.settings import Board
 from pipeline.simulation.description import shipped_settings
-from pipeline.stages.batch import Job
-from pipeline.stages.calibration import _on_board
+from pipeline.app.steps.batch import Job
+from pipeline.app.steps.calibration import _on_board
 from tests.published import TESTED, validation_document
 
 if TYPE_CHECKING:

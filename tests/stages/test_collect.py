@@ -4,10 +4,10 @@ import os
 import shutil
 from pathlib import Path
 
-from pipeline.config import load_campaign, settings_of_jobs
-from pipeline.pack import Pack
-from pipeline.results_folder import release_locks
-from pipeline.stages import batch
+from pipeline.app.config import load_campaign, settings_of_jobs
+from pipeline.core.pack import Pack
+from pipeline.app.results_folder import release_locks
+from pipeline.app.steps import batch
 
 DEMO = Path(__file__).parents[2] / "data" / "demo"
 SHEET = """unit,overrides

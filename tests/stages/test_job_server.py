@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.stages.job_server import COMMAND, start_server
+from pipeline.app.steps.job_server import COMMAND, start_server
 
 VERDICT = [*COMMAND, "verdict", "--results", "results", "--output", "done.json", "--failures"]
 

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.commands.research import study as main
-from pipeline.errors import ConfigurationError
+from imu_research.commands import study as main
+from pipeline.core.errors import ConfigurationError
 from pipeline.estimation.gates import MIN_DELTA_BIC
-from pipeline.model.effects import catalogue
-from pipeline.records import SENSORS
-from pipeline.study.bench import recordings_of
-from pipeline.study.cases import FAMILIES, SIZES, StudyCase, draw
-from pipeline.study.result import ScoredCase
-from pipeline.study.run import diagnose_case, judge, read_lines, scored
-from pipeline.study.scores import exact, first_is_right, in_the_set, not_seen, outside_answered
+from pipeline.physics.effects import catalogue
+from pipeline.core.records import SENSORS
+from imu_research.study.bench import recordings_of
+from imu_research.study.cases import FAMILIES, SIZES, StudyCase, draw
+from imu_research.study.result import ScoredCase
+from imu_research.study.run import diagnose_case, judge, read_lines, scored
+from imu_research.study.scores import exact, first_is_right, in_the_set, not_seen, outside_answered
 
 if TYPE_CHECKING:
     from pathlib import Path

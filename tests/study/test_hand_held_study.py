@@ -31,7 +31,7 @@ from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.multi_position.effects import model_of
 from pipeline.estimation.multi_position.selection import SelectionByHand
 from pipeline.estimation.noise import estimate_noise
-from pipeline.io.read import read_recordings
+from pipeline.ingest.read import read_recordings
 from pipeline.simulation.description import shipped_settings
 from tests.published import validate
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.study.bench import signals_left
-from pipeline.study.cases import StudyCase, draw
+from imu_research.study.bench import signals_left
+from imu_research.study.cases import StudyCase, draw
 
 
 def test_twice_the_effect_leaves_four_times_the_signal() -> None:

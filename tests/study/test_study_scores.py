@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.study.page import by_signal, confusions, found_at, instead, of_shapes, page, table_of
-from pipeline.study.result import ScoredCase, cases_of
-from pipeline.study.scores import (
+from imu_research.study.page import by_signal, confusions, found_at, instead, of_shapes, page, table_of
+from imu_research.study.result import ScoredCase, cases_of
+from imu_research.study.scores import (
     answer_scores,
     exact,
     excess_gone,

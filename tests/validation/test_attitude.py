@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.records import Recording, SensorCalibration
-from pipeline.validation.attitude import angle_between, attitude, drift, integrate
+from pipeline.core.records import Recording, SensorCalibration
+from pipeline.evaluation.held_out.attitude import angle_between, attitude, drift, integrate
 
 STILL = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -9,8 +9,8 @@ import pytest
 from scipy.signal import lfilter
 from unit_settings import settings_of
 
-from pipeline.records import Noise, SensorCalibration
-from pipeline.validation.expected_error import LinearizedSamples, expected_rms_error
+from pipeline.core.records import Noise, SensorCalibration
+from pipeline.evaluation.held_out.expected_error import LinearizedSamples, expected_rms_error
 
 UNITS, SAMPLES, INTERVAL = 2000, 300, 0.2
 WHITE, TAU = 0.01, 20.0

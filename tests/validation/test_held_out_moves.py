@@ -11,8 +11,8 @@ from unit_settings import with_noise
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
-from pipeline.validation.attitude import gravity_direction
-from pipeline.validation.heldout import validate
+from pipeline.evaluation.held_out.attitude import gravity_direction
+from pipeline.evaluation.held_out.heldout import validate
 from tests.published import diagnose
 
 

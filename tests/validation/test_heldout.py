@@ -9,15 +9,15 @@ import pytest
 from scipy.signal import lfilter
 from unit_settings import filter_of, settings_of
 
-from pipeline.model.effects import effect
-from pipeline.model.kinematics import earth_rate, reference_motion
-from pipeline.model.measurement import compensate, predicted_reading
-from pipeline.records import FittedEffect, Multiply, Noise, Recording, SensorCalibration, StageResult, Subtract
-from pipeline.signal.filters import apply_filter
+from pipeline.physics.effects import effect
+from pipeline.physics.kinematics import earth_rate, reference_motion
+from pipeline.physics.measurement import compensate, predicted_reading
+from pipeline.core.records import FittedEffect, Multiply, Noise, Recording, SensorCalibration, StageResult, Subtract
+from pipeline.physics.signal.filters import apply_filter
 from tests.published import validate
 
 if TYPE_CHECKING:
-    from pipeline.settings import Settings
+    from pipeline.core.settings import Settings
 
 DT = 0.05
 SENSORS = ("accelerometer", "gyroscope")

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.validation.samples import squared_norm_errors
+from pipeline.evaluation.held_out.samples import squared_norm_errors
 
 MATRIX = np.array([[1.03, 0.02, -0.01], [-0.015, 0.97, 0.03], [0.01, -0.02, 1.05]])
 VARIANCE = np.array([0.9, 1.2, 2.5]) ** 2

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.records import FittedEffect, SensorCalibration
-from pipeline.validation.heldout import residuals_over_temperature
-from pipeline.validation.samples import Samples
+from pipeline.core.records import FittedEffect, SensorCalibration
+from pipeline.evaluation.held_out.heldout import residuals_over_temperature
+from pipeline.evaluation.held_out.samples import Samples
 
 SLOPE = 2e-3  # g/degC, of z
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.commands import simulate
+from pipeline.app.commands import simulate
 
 ROOT = Path(__file__).parents[2]
 

@@ -11,8 +11,8 @@ import pytest
 import yaml
 from whole_run import run_campaign, settings_names
 
-from pipeline.config import load_campaign
-from pipeline.errors import ConfigurationError
+from pipeline.app.config import load_campaign
+from pipeline.core.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,10 +10,10 @@ import pytest
 from whole_run import run_campaign
 
 import pipeline
-from pipeline.commands import simulate, unpack
-from pipeline.config import load_campaign, settings_of_jobs
-from pipeline.results_folder import release_locks
-from pipeline.stages import batch
+from pipeline.app.commands import simulate, unpack
+from pipeline.app.config import load_campaign, settings_of_jobs
+from pipeline.app.results_folder import release_locks
+from pipeline.app.steps import batch
 
 pytestmark = pytest.mark.workflow
 

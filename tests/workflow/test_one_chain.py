@@ -11,10 +11,10 @@ from calls import OF_STEPS, counted, names
 from whole_run import run_campaign
 
 import pipeline
-from pipeline.commands import add, check, guide, plan, simulate
-from pipeline.study.cases import draw
-from pipeline.study.run import judge
-from pipeline.thesis.seeds import study_of
+from pipeline.app.commands import add, check, guide, plan, simulate
+from imu_research.study.cases import draw
+from imu_research.study.run import judge
+from imu_research.thesis.seeds import study_of
 from pipeline.unit import STEPS
 
 if TYPE_CHECKING:
@@ -29,8 +29,8 @@ TO_CALIBRATION = {"ingest", "filter", "fit", "validate", "diagnose", "calibratio
 BY_HAND = "--sensor mpu6050 --procedure multi_position --table hand --positions 24 --static 0 --validation 0 --quiet"
 # Functions of the library that a step calls, and what may call them beside the steps.
 OF_A_STEP = {
-    "check_recordings": {"pipeline/commands/readings.py"},  # of a log that belongs to no unit
-    "apply_filter": {"pipeline/thesis/seeds.py"},  # of exact readings, which have no noise to estimate
+    "check_recordings": {"pipeline/app/commands/readings.py"},  # of a log that belongs to no unit
+    "apply_filter": {"imu_research/thesis/seeds.py"},  # of exact readings, which have no noise to estimate
     "fit_stage": set(),
     "with_stated": set(),
     "validate": set(),
@@ -87,7 +87,7 @@ def test_nothing_but_the_steps_calls_what_they_call_of_the_library() -> None:
     callers: dict[str, set[str]] = {name: set() for name in OF_A_STEP}
     for file in [*ROOT.glob("pipeline/**/*.py"), *ROOT.glob("benchmarks/*.py")]:
         path = file.relative_to(ROOT).as_posix()
-        if not path.startswith("pipeline/stages/"):
+        if not path.startswith("pipeline/app/steps/"):
             for node in ast.walk(ast.parse(file.read_text())):
                 if isinstance(node, ast.ImportFrom):
                     for name in OF_A_STEP.keys() & {alias.name for alias in node.names}:

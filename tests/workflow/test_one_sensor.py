@@ -13,11 +13,11 @@ from calls import ONCE_A_RECORDING, counted
 from whole_run import run_campaign
 
 import pipeline
-from pipeline.commands import apply, simulate
-from pipeline.config import load_campaign
-from pipeline.errors import ConfigurationError
-from pipeline.io.write import write_recording
-from pipeline.records import Recording
+from pipeline.app.commands import apply, simulate
+from pipeline.app.config import load_campaign
+from pipeline.core.errors import ConfigurationError
+from pipeline.ingest.write import write_recording
+from pipeline.core.records import Recording
 
 from .conftest import Bench
 

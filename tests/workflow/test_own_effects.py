@@ -11,10 +11,10 @@ from calls import OF_STEPS, ONCE_A_RECORDING, ONCE_A_RECORDING_AND_SENSOR, Calls
 from whole_run import run_campaign
 
 import pipeline
-from pipeline.commands import apply, check, explain, simulate
-from pipeline.config import load_campaign
-from pipeline.model.effects import forget
-from pipeline.pack import Batch
+from pipeline.app.commands import apply, check, explain, simulate
+from pipeline.app.config import load_campaign
+from pipeline.physics.effects import forget
+from pipeline.core.pack import Batch
 
 from .conftest import Bench
 

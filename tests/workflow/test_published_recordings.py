@@ -11,10 +11,10 @@ import pytest
 from unit_settings import with_noise
 from whole_run import run_campaign
 
-from pipeline.config.campaign import load_campaign
+from pipeline.app.config.campaign import load_campaign
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
-from pipeline.io.read import read_recordings
+from pipeline.ingest.read import read_recordings
 from tests.published import validate
 
 from .conftest import ROOT, Bench

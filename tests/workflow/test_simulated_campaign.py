@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.commands import simulate
+from pipeline.app.commands import simulate
 
 from .conftest import Bench
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.config import code_digest
+from pipeline.app.config import code_digest
 
 from .conftest import ROOT, Bench, Run
 from .schemas import validator, violations
@@ -116,7 +116,7 @@ def test_a_change_in_the_code_of_a_method_makes_its_fits_again(runs: Mended) -> 
     }
     for job, module in modules.items():
         assert codes[job].endswith(code_digest(f"pipeline.estimation.{module}"))
-        assert code_digest("pipeline.stages.fit") in codes[job]
+        assert code_digest("pipeline.app.steps.fit") in codes[job]
 
 
 def test_every_file_of_a_unit_is_published_under_its_stable_path(bench: Bench) -> None:

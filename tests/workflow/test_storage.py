@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.results_folder import PUBLISHED_PATHS
+from pipeline.app.results_folder import PUBLISHED_PATHS
 
 ROOT = Path(__file__).parents[2]
 PLUGINS = ("snakemake_storage_plugin_fs", "snakemake_executor_plugin_cluster_generic")

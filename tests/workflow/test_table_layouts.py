@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from whole_run import run_campaign
 
-from pipeline.commands import simulate
-from pipeline.pack import Pack
-from pipeline.stages.unit_files import recordings_of
+from pipeline.app.commands import simulate
+from pipeline.core.pack import Pack
+from pipeline.app.steps.unit_files import recordings_of
 
 from .conftest import Bench
 

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from whole_run import run_campaign
 
-from pipeline.commands import simulate
-from pipeline.settings import Settings
-from pipeline.stages import batch, prior
-from pipeline.stages.unit_files import StoredUnit
+from pipeline.app.commands import simulate
+from pipeline.core.settings import Settings
+from pipeline.app.steps import batch, prior
+from pipeline.app.steps.unit_files import StoredUnit
 from pipeline.unit import Task
 
 pytestmark = pytest.mark.workflow

@@ -19,18 +19,18 @@ if Path(workflow.basedir, "pipeline").is_dir():
     paths = [workflow.basedir, os.getenv("PYTHONPATH", "")]
     os.environ.update(PYTHONPATH=os.pathsep.join(filter(None, paths)))
 
-from pipeline.config import code_digest, load_campaign, settings_of_jobs
-from pipeline.config.owner import check_owner, claim, complete_record
-from pipeline.errors import PipelineError
-from pipeline.files import write_atomically
+from pipeline.app.config import code_digest, load_campaign, settings_of_jobs
+from pipeline.app.config.owner import check_owner, claim, complete_record
+from pipeline.core.errors import PipelineError
+from pipeline.core.files import write_atomically
 from pipeline.estimation.stages import stage_module
-from pipeline.outcome import outcome
-from pipeline.pack import PACKED_STEPS as PUBLISHED_STAGES
-from pipeline.results_folder import finish_publishing, repetitions, replaced_folders
-from pipeline.run_progress import Monitor
-from pipeline.stages.batch import forget_last_outputs
-from pipeline.stages.job_server import COMMAND, start_server
-from pipeline.user_cache import use_cache
+from pipeline.output.outcome import outcome
+from pipeline.core.pack import PACKED_STEPS as PUBLISHED_STAGES
+from pipeline.app.results_folder import finish_publishing, repetitions, replaced_folders
+from pipeline.app.run_progress import Monitor
+from pipeline.app.steps.batch import forget_last_outputs
+from pipeline.app.steps.job_server import COMMAND, start_server
+from pipeline.core.user_cache import use_cache
 
 use_cache()
 RUNNING = not workflow.is_main_process
@@ -192,7 +192,7 @@ def stage_before(wildcards):
 
 def code_of_fit(wildcards):
     modules = (
-        "pipeline.stages.fit",
+        "pipeline.app.steps.fit",
         stage_module(wildcards.sensor, wildcards.stage),
     )
     return "".join(code_digest(module) for module in modules)

@@ -1,7 +1,7 @@
 # Publishes the files of all units, the summary and the campaign page; `snakemake --report` shows the pages.
 #
 # The published files are not an output of the rule, because Snakemake would delete them before the job and after a
-# failure. The stage replaces them by a complete new set; `pipeline.results_folder` detects edited or deleted files.
+# failure. The stage replaces them by a complete new set; `pipeline.app.results_folder` detects edited or deleted files.
 rule gather:
     input:
         settings=lambda wildcards: local(settings_file("campaign", "gather")),
@@ -16,6 +16,6 @@ rule gather:
         mem_mb=1000,
         runtime=10,
     params:
-        code=code_digest("pipeline.stages.gather"),
+        code=code_digest("pipeline.app.steps.gather"),
     shell:
         "{RUN} gather --config {input.settings:q} --output {output:q} > {log:q} 2>&1"

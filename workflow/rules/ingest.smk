@@ -22,7 +22,7 @@ if PLAN["apart"]:
             mem_mb=1000,
             runtime=10,
         params:
-            code=code_digest("pipeline.stages.ingest"),
+            code=code_digest("pipeline.app.steps.ingest"),
         shell:
             "{RUN} collect --config {input.settings:q} --output {output:q} > {log:q} 2>&1"
 
@@ -41,6 +41,6 @@ rule ingest:
         mem_mb=1000,
         runtime=10,
     params:
-        code=code_digest("pipeline.stages.ingest"),
+        code=code_digest("pipeline.app.steps.ingest"),
     shell:
         "{RUN} ingest --config {input.settings:q} --code {params.code} --recordings={input.recordings:q} --output {output:q} > {log:q} 2>&1"

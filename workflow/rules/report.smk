@@ -17,7 +17,7 @@ rule report:
         mem_mb=1000,
         runtime=10,
     params:
-        code=code_digest("pipeline.stages.report"),
+        code=code_digest("pipeline.app.steps.report"),
     shell:
         "{RUN} report --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q} --calibration {input.calibration:q}"
         " --validate {input.validate:q} --diagnose {input.diagnose:q}"

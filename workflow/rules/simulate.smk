@@ -17,6 +17,6 @@ if PLAN["simulation"]:
             runtime=10,
         params:
             folder=f"{RESULTS}/simulated",
-            code=code_digest("pipeline.commands.simulate"),
+            code=code_digest("pipeline.app.commands.simulate"),
         shell:
             "{RUN} simulate {params.folder:q} --from {input:q} --replace > {log:q} 2>&1"

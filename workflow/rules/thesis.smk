@@ -35,6 +35,6 @@ if PLAN["page"] == "thesis":
             runtime=10,
         params:
             campaign=lambda wildcards: str(CAMPAIGN.directory),
-            code=code_digest("pipeline.thesis.page"),
+            code=code_digest("imu_research.thesis.page"),
         shell:
             "{RUN} thesis page --campaign {params.campaign:q} --results {RESULTS:q} --output {output:q} > {log:q} 2>&1"

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.at_limits import changes_on_table
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE_SETTING, WanderPrior
@@ -60,8 +60,8 @@ from pipeline.estimation.uncertainty_budget import (
     noise_contribution,
     stage_parameters,
 )
-from pipeline.model.kinematics import table_motion
-from pipeline.records import (
+from pipeline.physics.kinematics import table_motion
+from pipeline.core.records import (
     AXES,
     BASE_COUNT,
     BIAS,
@@ -82,8 +82,8 @@ from pipeline.records import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.records import UnitRecordings
-    from pipeline.settings import DataSheet, Settings
+    from pipeline.core.records import UnitRecordings
+    from pipeline.core.settings import DataSheet, Settings
 
 
 NAME = "nonlinear_least_squares"

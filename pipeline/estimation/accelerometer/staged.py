@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.accelerometer.turn_extremes import (
     AxisTurns,
     Extremes,
@@ -51,8 +51,8 @@ from pipeline.estimation.uncertainty_budget import (
     scatter_contribution,
     stage_parameters,
 )
-from pipeline.model.effects import effect
-from pipeline.records import (
+from pipeline.physics.effects import effect
+from pipeline.core.records import (
     AXES,
     BASE,
     BASE_COUNT,
@@ -73,8 +73,8 @@ if TYPE_CHECKING:
 
     Quantities = dict[str, tuple[float, str]]  # value and unit of each parameter
     Outcome = tuple[list[CorrectionStep], Quantities]  # steps of the correction by a stage, and its parameters
-    from pipeline.records import UnitRecordings
-    from pipeline.settings import Settings
+    from pipeline.core.records import UnitRecordings
+    from pipeline.core.settings import Settings
 
 REPLICATES = 60  # synthetic turns: their covariance is known to a tenth
 SEED = 20190508  # any number

@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, linear_convergence_evidence
 from pipeline.estimation.monte_carlo import with_matrix
@@ -47,7 +47,7 @@ from pipeline.estimation.stages import FitStage
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
-from pipeline.records import (
+from pipeline.core.records import (
     AFTER_BASE,
     AXES,
     BASE,
@@ -61,13 +61,13 @@ from pipeline.records import (
     Subtract,
     Values,
 )
-from pipeline.signal.rests import runs
+from pipeline.physics.signal.rests import runs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.records import UnitRecordings
-    from pipeline.settings import Settings, Table
+    from pipeline.core.records import UnitRecordings
+    from pipeline.core.settings import Settings, Table
 
 
 NAME = "cholesky_lu"

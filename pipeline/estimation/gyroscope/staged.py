@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.engine import LinearMap, derivative
 from pipeline.estimation.least_squares import ScaledColumns, convergence_evidence
 from pipeline.estimation.noise import wander_prior
@@ -34,7 +34,7 @@ from pipeline.estimation.stages import FitStage, staged_result
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
-from pipeline.records import (
+from pipeline.core.records import (
     AFTER_BASE,
     AXES,
     BASE,
@@ -48,15 +48,15 @@ from pipeline.records import (
     corrected,
     motion_at_rest,
 )
-from pipeline.signal.rests import runs
+from pipeline.physics.signal.rests import runs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     # step of the correction by a stage, and value and unit of each of its parameters
     Outcome = tuple[Subtract | Multiply, dict[str, tuple[float, str]]]
-    from pipeline.records import UnitRecordings
-    from pipeline.settings import Settings
+    from pipeline.core.records import UnitRecordings
+    from pipeline.core.settings import Settings
 
 # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
 DIFFERENCE_STEP_DPS = 1e-5
@@ -294,7 +294,7 @@ def _memory(recording: Recording) -> float:
     if applied["name"] == "none":
         return 0.0
     try:
-        from pipeline.signal.filters import filter_autocovariance  # noqa: PLC0415  (needed for filtered recordings only)
+        from pipeline.physics.signal.filters import filter_autocovariance  # noqa: PLC0415  (needed for filtered recordings only)
 
         covariance = np.abs(filter_autocovariance(recording))
     except (ConfigurationError, KeyError):

@@ -39,14 +39,14 @@ from pipeline.estimation.multi_position.model import (
 )
 from pipeline.estimation.multi_position.soaks import Soaks, parted
 from pipeline.estimation.rest_means import HELD_OUT, Rests, rests_of
-from pipeline.records import BASE_COUNT
+from pipeline.core.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.design import EffectColumns
-    from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
-    from pipeline.settings import DataSheet, Settings
+    from pipeline.core.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
+    from pipeline.core.settings import DataSheet, Settings
 
 FORCE_ITERATIONS = 12  # of effects that depend on the force
 SETTLED_FORCE_G = 1e-12  # g

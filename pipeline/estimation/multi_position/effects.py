@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.candidates import AUTO, limits_of, offered
 from pipeline.estimation.multi_position import accelerometer, gyroscope
@@ -17,14 +17,14 @@ from pipeline.estimation.multi_position.selection import SelectionByHand, fit_co
 from pipeline.estimation.noise import with_noises
 from pipeline.estimation.rest_means import ROLE
 from pipeline.estimation.stages import given_calibration, is_given
-from pipeline.model.effects import effect
+from pipeline.physics.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.estimation.multi_position.model import Model
-    from pipeline.records import Noise, Recording, SensorCalibration, UnitRecordings
-    from pipeline.settings import Settings
+    from pipeline.core.records import Noise, Recording, SensorCalibration, UnitRecordings
+    from pipeline.core.settings import Settings
 
 
 def accelerometer_of(recordings: UnitRecordings, settings: Settings) -> SensorCalibration | None:

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
 from pipeline.estimation.engine import ErrorMixture
@@ -36,7 +36,7 @@ from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypo
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.records import Mask, Values
+    from pipeline.core.records import Mask, Values
 
     Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
 

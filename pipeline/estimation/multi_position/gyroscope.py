@@ -8,7 +8,7 @@ where
     y, b, M : reading and bias, deg/s, and matrix
     z, p    : effects and their parameters; in a move at the specific force of the rest, rotated along the move
     w       : creep rate of the unit in a rest, across gravity by the accelerometer (K = M^-1); the rate about gravity
-              is unknown and of the same size (``pipeline.signal.quiet_motion.posterior_creep_rates``)
+              is unknown and of the same size (``pipeline.physics.signal.quiet_motion.posterior_creep_rates``)
     u       : direction of gravity by the calibrated accelerometer (``gravity``); A_0 as in ``moves``
     E       : two directions across u_after; W whitens the integrated noise of the gyroscope, the uncertainty of the
               rate between samples, and the noise of the accelerometer
@@ -52,8 +52,8 @@ from pipeline.estimation.multi_position.moves import (
     tangents,
     to_the_end,
 )
-from pipeline.model.kinematics import skew
-from pipeline.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX
+from pipeline.physics.kinematics import skew
+from pipeline.core.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -61,8 +61,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.rest_means import Rests
-    from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
-    from pipeline.settings import Procedure
+    from pipeline.core.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
+    from pipeline.core.settings import Procedure
 
 MIN_MOVES = 6  # two equations each, for the nine of the matrix
 RATE_ITERATIONS = 6  # of effects that depend on the rate

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.estimation.multi_position.model import Equations, NoiseHypothesis
-    from pipeline.records import Values
+    from pipeline.core.records import Values
 
 # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 MIN_NEW_NORM_SHARE = 1e-3

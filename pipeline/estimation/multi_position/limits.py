@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.multi_position.model import EquationBlock
-from pipeline.records import base_values
+from pipeline.core.records import base_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -27,7 +27,7 @@ The direction of gravity before and after every move, by the calibrated accelero
 where
 
     u_mean : direction of the rest's mean, T its length
-    w      : rate at which the unit creeps (``pipeline.signal.quiet_motion.posterior_creep_rates``)
+    w      : rate at which the unit creeps (``pipeline.physics.signal.quiet_motion.posterior_creep_rates``)
     s      : standard deviation of the mean of the half second by white noise, across u
 
 A unit in a hand or on a soft support creeps after it was set down, not always steadily. The half second next to a move
@@ -45,18 +45,18 @@ import numpy as np
 from pipeline.estimation.engine import root_of
 from pipeline.estimation.multi_position.model import motion_of
 from pipeline.estimation.rest_means import ROLE, Rests, rest_means, rests_of, sound_samples
-from pipeline.model.effects import effect
-from pipeline.model.kinematics import turn_by_vector
-from pipeline.model.measurement import compensate
-from pipeline.records import BASE, BASE_COUNT, BIAS, MATRIX, matrix_of
-from pipeline.signal.filters import filter_autocovariance, variance_of_mean
-from pipeline.signal.rests import Rest
+from pipeline.physics.effects import effect
+from pipeline.physics.kinematics import turn_by_vector
+from pipeline.physics.measurement import compensate
+from pipeline.core.records import BASE, BASE_COUNT, BIAS, MATRIX, matrix_of
+from pipeline.physics.signal.filters import filter_autocovariance, variance_of_mean
+from pipeline.physics.signal.rests import Rest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.records import Index, Mask, Recording, SensorCalibration, Values
-    from pipeline.settings import Procedure
+    from pipeline.core.records import Index, Mask, Recording, SensorCalibration, Values
+    from pipeline.core.settings import Procedure
 
 MAX_MOVE_S = 60.0  # see ``moves_of``
 MAX_INTERPOLATED_INTERVALS = 3.5  # intervals without a sample, over which a rate is not interpolated

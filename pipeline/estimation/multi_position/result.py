@@ -38,13 +38,13 @@ from pipeline.estimation.uncertainty_budget import (
     limit_contribution,
     scatter_contribution,
 )
-from pipeline.records import Contribution, Recording, SensorCalibration, StageResult, Values, base_values
+from pipeline.core.records import Contribution, Recording, SensorCalibration, StageResult, Values, base_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import UnitRecordings
-    from pipeline.settings import Procedure, Settings
+    from pipeline.core.records import UnitRecordings
+    from pipeline.core.settings import Procedure, Settings
 
 
 STEP_UNCERTAINTIES = 0.1  # of a standard uncertainty: the columns are differentiated where they are used

@@ -31,16 +31,16 @@ from pipeline.estimation.multi_position.model import Model, NoiseHypothesis, Sta
 from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import Score, without
 from pipeline.estimation.selection import MAX_SELECTED_EFFECTS
-from pipeline.model.effects import catalogue, effect
-from pipeline.model.effects.base import Effect, Owner
+from pipeline.physics.effects import catalogue, effect
+from pipeline.physics.effects.base import Effect, Owner
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from pipeline.estimation.multi_position.model import Equations
     from pipeline.estimation.rest_means import Rests
-    from pipeline.records import Mask, Noise, SensorCalibration, Values
-    from pipeline.settings import DataSheet
+    from pipeline.core.records import Mask, Noise, SensorCalibration, Values
+    from pipeline.core.settings import DataSheet
 
 
 MAX_SELECTION_ROUNDS = 3 * MAX_SELECTED_EFFECTS

@@ -16,12 +16,12 @@ import numpy as np
 
 from pipeline.estimation.multi_position.model import EquationBlock, effect_readings, motion_of
 from pipeline.estimation.rest_means import Rests, nearest_to_reference
-from pipeline.records import BASE_COUNT
+from pipeline.core.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.model import State
-    from pipeline.records import Index, Values
+    from pipeline.core.records import Index, Values
 
 
 @dataclass(frozen=True)

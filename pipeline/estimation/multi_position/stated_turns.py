@@ -3,7 +3,7 @@
     Y = integral (y - b) dt,   |e^T Y - A| < |A| / 10,   |Y - (e^T Y) e| < |e^T Y| / 4
 
 with the readings y, the bias b of the rests, the stated axis e and the angle A. Without a sheet e is a body axis and A
-a multiple of the stated angle (``pipeline.signal.segments``).
+a multiple of the stated angle (``pipeline.physics.signal.segments``).
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.multi_position.moves import sound_span, spans_between
 from pipeline.estimation.rest_means import ROLE
-from pipeline.records import AXES
-from pipeline.signal.segments import MAX_AXIS_SINE, SCALE, multiples
+from pipeline.core.records import AXES
+from pipeline.physics.signal.segments import MAX_AXIS_SINE, SCALE, multiples
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.estimation.rest_means import Rests
-    from pipeline.records import Index, Recording, Values
-    from pipeline.settings import HandTurns, Procedure
+    from pipeline.core.records import Index, Recording, Values
+    from pipeline.core.settings import HandTurns, Procedure
 
 BEGUN_DEG = 2.0  # as ``TURN_LIMIT_DEG`` of a rest: a larger turn before the first rest of a recording is motion
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from unit_settings import settings_of, with_noise
 
-from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
+from pipeline.core.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.gyroscope.cholesky_lu import factorise, fit
 from pipeline.estimation.stages import fit_stage
-from pipeline.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
-from pipeline.records.correction import corrected
+from pipeline.core.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
+from pipeline.core.records.correction import corrected
 
 if TYPE_CHECKING:
-    from pipeline.settings import Settings
+    from pipeline.core.settings import Settings
 
 INTERVAL = 0.12
 S = np.array([1.01, 0.98, 1.03])

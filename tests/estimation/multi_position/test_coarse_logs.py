@@ -10,7 +10,7 @@ from ferraris_session import FITS
 from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.stated_lines import with_stated
-from pipeline.records import BIAS, base_values
+from pipeline.core.records import BIAS, base_values
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 

@@ -11,7 +11,7 @@ from hand_session import WARM, Unit, hand_held
 from scipy.special import stdtrit
 from unit_settings import settings_of, with_noise
 
-from pipeline.errors import NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.multi_position.accelerometer import model_of
 from pipeline.estimation.multi_position.model import selection_hypotheses
@@ -20,7 +20,7 @@ from pipeline.estimation.noise import estimate_noise
 from tests.published import validate
 
 if TYPE_CHECKING:
-    from pipeline.records import SensorCalibration
+    from pipeline.core.records import SensorCalibration
 
 LOWER = [0, 1, 2, *(3 + 3 * np.tril_indices(3)[0] + np.tril_indices(3)[1]).tolist()]
 CASES = [

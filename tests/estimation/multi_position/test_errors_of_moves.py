@@ -11,10 +11,10 @@ from hand_simulator import Drawn, Hand, draw
 from unit_settings import with_noise
 
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.signal.rests import find_rests
+from pipeline.physics.signal.rests import find_rests
 
 if TYPE_CHECKING:
-    from pipeline.records import SensorCalibration
+    from pipeline.core.records import SensorCalibration
 
 
 def squared_errors(found: SensorCalibration, drawn: Drawn) -> np.ndarray:

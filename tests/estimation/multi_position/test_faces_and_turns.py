@@ -10,16 +10,16 @@ from ferraris_session import PROCEDURE, Session, held_out, in_parts, simulated
 from scipy import stats
 from unit_settings import settings_of, with_noise
 
-from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.gauss_markov import WHITE_SETTING
 from pipeline.estimation.multi_position.fit import fit
 from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, GyroscopeModel, model_of
 from pipeline.estimation.multi_position.model import NoiseHypothesis, State
 from pipeline.estimation.noise import estimate_noise, noise_of
 from pipeline.estimation.stages import fit_stage, last_fit
-from pipeline.signal.rests import find_rests
-from pipeline.signal.segments import multiples, turns_by_hand
-from pipeline.validation.attitude import gravity_direction
+from pipeline.physics.signal.rests import find_rests
+from pipeline.physics.signal.segments import multiples, turns_by_hand
+from pipeline.evaluation.held_out.attitude import gravity_direction
 from tests.published import diagnose
 
 FACE = np.radians(PROCEDURE.faces.accuracy_deg)

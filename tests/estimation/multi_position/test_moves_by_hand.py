@@ -14,19 +14,19 @@ from unit_settings import settings_of, with_noise
 from imu_logs.log import Log
 from imu_logs.profile import Checks
 from imu_logs.units import TRIADS
-from pipeline.errors import CannotCalibrateError
+from pipeline.core.errors import CannotCalibrateError
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.multi_position.gyroscope import model_of
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.moves import to_the_end
-from pipeline.io.quality_flags import examine
-from pipeline.model.effects import effect
+from pipeline.ingest.quality_flags import examine
+from pipeline.physics.effects import effect
 from pipeline.simulation.trajectory import rotation_about
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording
+    from pipeline.core.records import Recording
 
 
 def test_a_steady_turn_is_integrated_exactly() -> None:

@@ -14,13 +14,13 @@ from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.rest_means import split_rests
-from pipeline.io.read import read_recordings
-from pipeline.model.measurement import compensate
+from pipeline.ingest.read import read_recordings
+from pipeline.physics.measurement import compensate
 from pipeline.simulation.description import shipped_settings
-from pipeline.validation.attitude import gravity_direction
+from pipeline.evaluation.held_out.attitude import gravity_direction
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.core.records import Recording, SensorCalibration
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "xsens_mti_multi_position"
 BY_HAND_DEG = 6.1  # the most that turns of 360 deg by hand depart in a session of the same laboratory

@@ -16,13 +16,13 @@ from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.io.read import read_recordings
-from pipeline.settings import Window
-from pipeline.signal.segments import cut
+from pipeline.ingest.read import read_recordings
+from pipeline.core.settings import Window
+from pipeline.physics.signal.segments import cut
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.core.records import Recording, SensorCalibration
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "ferraris_wearable"
 PROCEDURE = shipped_settings(procedure="ferraris").procedure

@@ -1,0 +1,316 @@
+"""Draw the cases of a study: the hidden effects of a unit with their sizes, and how the unit is recorded.
+
+The family, the number and the study's seed determine a case. Families:
+
+    single, small, tiny  one observable effect at the sensor file's size, x0.3, x0.1
+    pairs, pairs_wander  two of them; with five times the bias wander
+    triples              three
+    null_<noise>         nothing; both sensors are judged
+    null_sensors         nothing, in any sensor of ``sensor_files`` on any shipped table
+    null_hand_<noise>    nothing, in any of them by hand, 15 to 40 rests
+    unseen               an effect that the procedure cannot show
+    removed              one effect, which is then removed from the catalogue
+    one_axis             an effect on one axis only
+    shape_<shape>        physics in a functional form that is not in the catalogue
+    lost, coarse, cold   one effect; a tenth of the samples lost, temperature in steps of 0.5 degC, no temperature
+    cycle_<shape>        such a function of temperature, in a room that warms and cools by some degrees
+    staged               one effect, in a unit whose base is calibrated stage by stage
+    limit_<percent>      one effect at 30, 60 or 100 % of its detection size (``imu_research.study.bench.at_detection``)
+
+Effects have the size that the data sheet states: for the MPU-6050 the MPU-6000/6050 product specification 3.4, for the
+STIM300 its data sheet TS1524 and that of the STIM210's gyroscopes. Other sizes, like the shares and rates below, are
+assumptions. One number stands for all parameters, with random signs. A lag is at least the shortest of the register
+map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.uncertainty_budget import DITHERED
+from pipeline.core.files import CONFIGS
+from pipeline.physics.effects import effect
+from pipeline.core.records import SENSORS, Values
+from pipeline.simulation.description import shipped_settings
+
+if TYPE_CHECKING:
+    from pipeline.core.settings import DataSheet
+
+NOISES = ("white", "normal", "wander", "random_walk", "one_over_f", "ar_06", "ar_09")
+SHAPES = ("gear_mesh", "temperature_step", "saturation", "exponential", "band")
+OF_TEMPERATURE = ("temperature_step", "saturation", "exponential")
+FAMILIES = (
+    "single", "small", "tiny", "pairs", "pairs_wander", "triples", *(f"null_{noise}" for noise in NOISES), "unseen",
+    "removed", "one_axis", *(f"shape_{shape}" for shape in SHAPES), "lost", "coarse", "cold",
+    *(f"cycle_{shape}" for shape in OF_TEMPERATURE), "staged", "limit_30", "limit_60", "limit_100", "null_sensors",
+    *(f"null_hand_{noise}" for noise in ("white", "normal", "wander", "random_walk")),
+)  # fmt: skip  # a new one goes last: its place is part of every case's random numbers
+# Long recordings at several rates, so that each observable effect can be detected.
+LONG: dict[str, Any] = {"rates_dps": (20.0, 60.0, 100.0, 200.0), "static_s": 300.0}
+COURSES: dict[str, dict[str, Any]] = {
+    "stop_and_go": {**LONG, "step_deg": 3.0, "dwell_s": 2.0, "both_directions": True},
+    "continuous": {**LONG, "accelerometer_rates_dps": (2.0, 5.0, 30.0), "both_directions": True},
+    "one_way": {**LONG, "step_deg": 3.0, "dwell_s": 2.0},
+}
+ALTERNATIVES = [  # not hidden together: their signals are nearly alike
+    {"time_offset", "low_pass_lag"},
+    {"lever_arm", "inner_lever_arms"},
+    {"bias_temperature", "bias_temperature_quadratic"},
+    {"table_rate_ripple", "table_encoder_error"},
+]
+FACTOR = {"small": 0.3, "tiny": 0.1}  # of the sensor file's size
+WANDER = {"white": 0.0, "normal": 1.0, "wander": 5.0, "random_walk": 0.0, "one_over_f": 0.0}  # of the sensor file's
+STIM_SHARE = 0.25  # of the units of the families that have both models
+METHODS = REFERENCE, STAGED, METHODS_OF_HAND_HELD_CASES = (
+    "reference_least_squares",
+    "staged",
+    "rests_and_moves",
+)  # that fit a base
+INTERVAL_S, INTERVAL_BY_HAND_S = 0.12, 0.01  # of a sample: the default of a simulation; by hand, moves are faster
+TABLE_SHARES = {
+    "acutronic": 0.5,
+    "mark2": 0.45,
+    "single_axis": 0.05,
+}  # and their shares; the last takes 20 times as long
+RESTS_BY_HAND = 15, 40  # by hand; from 15 on, some are held out of a fit
+CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
+
+
+@dataclass(frozen=True)
+class StudyCase:
+    """The truth of one unit of a study."""
+
+    family: str
+    number: int
+    seed: int
+    model: str
+    sensor: str  # the sensor with the hidden effects
+    procedure: str
+    hidden: dict[str, list[float]] = field(default_factory=dict)  # effects and their parameters
+    wander: float = 1.0  # bias wander, relative to the sensor file
+    noise: str = "normal"
+    left_out: tuple[str, ...] = ()  # effects that are removed from the catalogue
+    shape: str = ""  # of physics that is not in the catalogue
+    amplitude: tuple[float, ...] = ()  # of that physics on each axis, relative to ``bench.AMPLITUDE``
+    room_degc: float | None = None  # swing of the room's temperature; None: the simulator's
+    method: str = REFERENCE  # by which the base is calibrated
+    table: str = "acutronic"  # ``hand``: rests and moves by hand
+    rests: int = 0  # by hand
+
+    @property
+    def key(self) -> str:
+        """The identifier of the case in a study's files."""
+        return f"{self.family}-{self.number:05d}"
+
+    @property
+    def kind(self) -> str:
+        """The first word of the family."""
+        return self.family.partition("_")[0]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the case as a JSON document."""
+        return {"key": self.key, **asdict(self)}
+
+
+def draw(family: str, number: int, seed: int) -> StudyCase:
+    """Draw the case that family, number and seed determine."""
+    rng = np.random.default_rng([seed, FAMILIES.index(family), number])
+    kind, _, detail = family.partition("_")
+    model = "stim300" if kind in ("single", "null") and rng.random() < STIM_SHARE else "mpu6050"
+    sensor = str(rng.choice(SENSORS))
+    procedure = str(rng.choice(["stop_and_go", "continuous", "one_way"], p=[0.5, 0.3, 0.2]))
+    if kind == "null":
+        by_hand, noise = detail.startswith("hand_"), detail.removeprefix("hand_")
+        case = StudyCase(family, number, seed, model, sensor, procedure, noise=noise, wander=WANDER.get(noise, 1.0))
+        if detail == "sensors" or by_hand:
+            case = replace(case, model=str(rng.choice(sensor_files(INTERVAL_BY_HAND_S if by_hand else INTERVAL_S))))
+        if detail == "sensors":
+            return replace(case, noise="normal", table=str(rng.choice([*TABLE_SHARES], p=[*TABLE_SHARES.values()])))
+        rests = int(rng.integers(RESTS_BY_HAND[0], RESTS_BY_HAND[1] + 1)) if by_hand else 0
+        return (
+            replace(case, procedure="multi_position", method=METHODS_OF_HAND_HELD_CASES, table="hand", rests=rests)
+            if by_hand
+            else case
+        )
+    if kind in ("shape", "cycle"):
+        procedure = "continuous" if detail == "band" else "stop_and_go"
+        amplitude = tuple((rng.uniform(0.7, 1.3, 3) * rng.choice([-1.0, 1.0], 3)).tolist())
+        room = CYCLE_DEGC if kind == "cycle" else None
+        return StudyCase(
+            family, number, seed, model, sensor, procedure, shape=detail, amplitude=amplitude, room_degc=room
+        )
+    if kind == "unseen":
+        return _unseen(number, seed, rng)
+    if kind == "staged":
+        procedure = "stop_and_go"  # the method needs rests, and turns in both directions
+    names = _names(kind, model, sensor, procedure, rng)
+    hidden = {name: drawn(model, sensor, name, rng, FACTOR.get(family, 1.0)) for name in names}
+    if kind == "one":  # parameters are in the order of the axes
+        for values in hidden.values():
+            values.reshape(3, -1)[np.arange(3) != rng.integers(3)] = 0.0
+    return replace(
+        StudyCase(family, number, seed, model, sensor, procedure),
+        hidden={name: values.tolist() for name, values in hidden.items()},
+        wander=5.0 if detail == "wander" else 1.0,
+        noise=family if family in ("lost", "coarse", "cold") else "normal",
+        left_out=tuple(names) if kind == "removed" else (),
+        method=STAGED if kind == "staged" else REFERENCE,
+    )
+
+
+def _names(kind: str, model: str, sensor: str, procedure: str, rng: np.random.Generator) -> list[str]:
+    pool = observable(model, sensor, procedure)
+    if kind == "one":
+        pool = [name for name in pool if len(effect(name).parameters(sensor)) % 3 == 0 and name != "lever_arm"]
+    if kind == "cold":
+        pool = [name for name in pool if "temperature" not in effect(name).needs]
+    count = {"pairs": 2, "triples": 3}.get(kind, 1)
+    while True:
+        names = [str(name) for name in rng.choice(pool, count, replace=False)]
+        if not any(len(same & set(names)) > 1 for same in ALTERNATIVES):
+            return names
+
+
+def _unseen(number: int, seed: int, rng: np.random.Generator) -> StudyCase:
+    """Draw an effect that is not observable: in turns in one direction, of the table to a gyroscope, or at rest."""
+    cells = [("one_way", "gyroscope", name) for name in sorted(ONE_WAY["gyroscope"])]
+    cells += [(way, "gyroscope", name) for way in ("stop_and_go", "one_way") for name in UNSEEN_GYROSCOPE]
+    cells += [("at_rest", "accelerometer", name) for name in AT_REST]
+    procedure, sensor, name = cells[int(rng.integers(len(cells)))]
+    hidden = {name: drawn("mpu6050", sensor, name, rng).tolist()}
+    return StudyCase("unseen", number, seed, "mpu6050", sensor, procedure, hidden)
+
+
+TABLE = {  # deg; ripple relative: a table of hobby parts, by assumption
+    "table_tilt": 0.2,
+    "table_axis_nonorthogonality": 0.1,
+    "table_encoder_error": 0.1,
+    "table_rate_ripple": 5e-3,
+    "table_backlash": 0.1,
+}
+SIZES: dict[str, dict[str, dict[str, float | tuple[float, ...]]]] = {
+    "mpu6050": {
+        "accelerometer": {
+            "bias_temperature": 5e-4,
+            "bias_temperature_quadratic": (5e-4, 3e-5) * 3,
+            "warm_up": (5e-3, 5e-3, 5e-3, 180.0),
+            "bias_drift": 3e-6,
+            "scale_factor_temperature": 2e-4,
+            "scale_factor_asymmetry": 3e-3,
+            "quadratic_nonlinearity": 5e-3,
+            "cubic_nonlinearity": 5e-3,
+            "cross_axis_nonlinearity": 3e-3,
+            "vibration_rectification": 2e-3 / 30.0,
+            "hysteresis": 1e-3,
+            "rate_dependence": 5e-5,
+            "lever_arm": 0.05,
+            "inner_lever_arms": 3e-3,
+            "time_offset": 0.02,
+            "low_pass_lag": (0.019,),
+            "clock_rate": 200.0,
+            **TABLE,
+        },
+        "gyroscope": {
+            "bias_temperature": 0.16,
+            "bias_temperature_quadratic": (0.16, 5e-3) * 3,
+            "warm_up": (0.3, 0.3, 0.3, 180.0),
+            "bias_drift": 2e-4,
+            "scale_factor_temperature": 3e-4,
+            "scale_factor_asymmetry": 2e-3,
+            "quadratic_nonlinearity": 1.6e-5,
+            "cubic_nonlinearity": 1.3e-7,
+            "vibration_rectification": 0.05 / 100.0,
+            "g_sensitivity": 0.1,
+            "g_squared_sensitivity": 0.02,
+            "earth_rotation": 0.0042,
+            "time_offset": 0.02,
+            "low_pass_lag": (0.019,),
+            "clock_rate": 200.0,
+            **TABLE,
+        },
+    },
+    "stim300": {
+        "accelerometer": {
+            "bias_temperature": 4e-5,
+            "warm_up": (1e-3, 1e-3, 1e-3, 180.0),
+            "scale_factor_asymmetry": 1e-4,
+            "quadratic_nonlinearity": 1e-4,
+            "cubic_nonlinearity": 1e-4,
+            "cross_axis_nonlinearity": 1e-4,
+            "lever_arm": 0.05,
+            "inner_lever_arms": 0.012,
+            "time_offset": 2e-3,
+            "table_tilt": 0.02,
+            "table_axis_nonorthogonality": 0.01,
+            "table_encoder_error": 0.01,
+        },
+        "gyroscope": {
+            "bias_temperature": 2.0 / 3600.0,
+            "warm_up": (5e-3, 5e-3, 5e-3, 180.0),
+            "scale_factor_asymmetry": 1e-4,
+            "g_sensitivity": 8.0 / 3600.0,
+            "earth_rotation": 0.0042,
+            "time_offset": 2e-3,
+            "table_rate_ripple": 5e-4,
+        },
+    },
+}
+
+# Effects that a procedure does not show, or shows by less than a detection needs (theory: the page of the effect).
+UNSEEN_GYROSCOPE = ("table_tilt", "table_backlash", "table_axis_nonorthogonality")
+SAME_GYROSCOPE = ("table_encoder_error",)  # in a gyroscope its derivative equals a ripple of the rate
+ONE_WAY = {
+    "accelerometer": {"vibration_rectification", "rate_dependence", "table_backlash"},
+    "gyroscope": {"scale_factor_asymmetry", "vibration_rectification"},
+}
+# Their lambda (``imu_research.study.bench``) is below 150; a detection takes 40 to 100.
+FAINT = {
+    "mpu6050": {"accelerometer": {"scale_factor_temperature"}, "gyroscope": {"scale_factor_temperature"}},
+    "stim300": {
+        "accelerometer": {"bias_temperature", "quadratic_nonlinearity", "cubic_nonlinearity"},
+        "gyroscope": {"bias_temperature"},
+    },
+}
+AT_REST = (
+    "lever_arm", "inner_lever_arms", "time_offset", "low_pass_lag", "clock_rate", "vibration_rectification",
+    "rate_dependence",
+)  # fmt: skip
+
+
+@cache
+def sensor_files(interval_s: float) -> list[str]:
+    """Return the shipped sensor files whose rounding to counts is noise: white noise dithers it in both sensors."""
+
+    def dithered(data_sheet: DataSheet) -> bool:
+        return bool(data_sheet.noise_density * np.sqrt(0.5 / interval_s) * data_sheet.counts_per_unit >= DITHERED)
+
+    names = sorted(path.stem for path in (CONFIGS / "sensor").glob("*.yaml"))
+    models = {name: shipped_settings(sensor=name).sensor for name in names}
+    return [name for name, model in models.items() if all(dithered(model.of(sensor)) for sensor in SENSORS)]
+
+
+def observable(model: str, sensor: str, procedure: str) -> list[str]:
+    """Return the effects that are observable with a procedure at their size."""
+    hidden = set(FAINT[model][sensor])
+    if sensor == "gyroscope":
+        hidden |= {*UNSEEN_GYROSCOPE, *SAME_GYROSCOPE}
+    if procedure == "one_way":
+        hidden |= ONE_WAY[sensor]
+    return [name for name in SIZES[model][sensor] if name not in hidden]
+
+
+def drawn(model: str, sensor: str, name: str, rng: np.random.Generator, factor: float = 1.0) -> Values:
+    """Return the parameters of an effect at its size times ``factor``, within 30 %, with random signs."""
+    count = len(effect(name).parameters(sensor))
+    size = SIZES[model][sensor][name]
+    values = np.broadcast_to(np.atleast_1d(np.array(size, float)), count) * factor * rng.uniform(0.7, 1.3)
+    values = values * rng.choice([-1.0, 1.0], count)
+    if name == "low_pass_lag":
+        values = np.abs(values)
+    if name == "warm_up":
+        values[3] = np.exp(rng.uniform(np.log(90.0), np.log(400.0)))
+    return np.asarray(values, np.float64)

@@ -1,0 +1,288 @@
+"""Configure and run the steps of one unit in memory: a unit of a campaign, or recordings without a campaign."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from contextlib import contextmanager
+from ctypes import CDLL
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import scipy.linalg  # noqa: F401  (loads its library of linear algebra, so that ``environment`` limits its threads)
+from threadpoolctl import ThreadpoolController, threadpool_limits
+
+from imu_logs import CANONICAL_CSV, load_profile
+from pipeline.app.config.campaign import Campaign, UnitRow, cut_batches
+from pipeline.app.config.compose import Composer
+from pipeline.app.config.layers import as_list, key_of
+from pipeline.app.config.options import RUN_SETTINGS, Problem, nearest, parse
+from pipeline.app.config.stage_settings import as_job_reads, settings_in_memory
+from pipeline.app.config.user_effects import PYTHON
+from pipeline.core.errors import ConfigurationError, InputError, MissingInputError, PipelineError, as_published, failure_of
+from pipeline.ingest.files import candidate_files, wrong_name
+from pipeline.ingest.read import IN_MEMORY, of_one_sensor, tried
+from pipeline.ingest.recordings_sheet import SHEET, sheet_of_mapping, with_sheet
+from pipeline.physics.effects import registered
+from pipeline.output.outcome import run_command
+from pipeline.core.settings import UserEffectFiles
+from pipeline.unit import Task, UnitFiles, UnitState, run_steps, tasks_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    import pandas as pd
+
+    from pipeline.core.records import Recording
+    from pipeline.core.settings import Settings
+
+    Paths = Sequence[str | os.PathLike[str]]
+    Recordings = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str] | pd.DataFrame]
+
+if sys.platform == "linux":  # else threadpoolctl starts the program ldconfig to find the library, which is loaded
+    getattr(ThreadpoolController, "_system_libraries", {}).setdefault("libc", CDLL(None))
+NO_EFFECTS = UserEffectFiles(formulas=[], python=[])
+NO_CAMPAIGN = Path(__file__).with_name("no_campaign")  # does not exist: no options or effects of a campaign
+
+
+@dataclass(frozen=True)
+class ConfiguredUnit:
+    """A unit with its settings, the files of its recordings, and the stages of the fit of each sensor."""
+
+    row: UnitRow
+    files: UnitFiles
+    stages: Mapping[str, Sequence[str]]
+    run: Mapping[str, Any] = field(default_factory=dict)  # settings of the run that the page states
+
+    def settings(self, task: Task) -> Settings:
+        """Return the settings that a task reads, as its job reads them from a file."""
+        stage = task.step if task.step != "fit" else "effects" if task.stage == "effects" else "fit"
+        return settings_in_memory(self.row, stage, task.sensor, self.run)
+
+    def with_missing(self) -> ConfiguredUnit:
+        """Return the unit with all recordings optional."""
+        procedure = self.row.config.procedure
+        optional = {name: entry.replaced(optional=True) for name, entry in procedure.recordings.items()}
+        config = self.row.config.replaced(procedure=procedure.replaced(recordings=optional))
+        return replace(self, row=replace(self.row, config=config))
+
+    def with_effects(self, sensor: str, names: Sequence[str]) -> ConfiguredUnit:
+        """Return the unit with effects in the model of a sensor, instead of those that are configured."""
+        effects = self.row.config.effects.replaced(**{sensor: list(names)})
+        return _configured(replace(self.row, config=self.row.config.replaced(effects=effects)), self.files)
+
+    def state(self) -> UnitState:
+        """Return the unit before its first step."""
+        return UnitState(self.row.name, self.files)
+
+    def run_to(
+        self, until: str = "calibration", *, first: str = "ingest", fits: bool = True, state: UnitState | None = None
+    ) -> UnitState:
+        """Run the steps in memory, from ``first`` to ``until``.
+
+        ``fits``: whether to include the stage ``effects``, the slowest of a fit. ``state``: filled by each step, so
+        that it holds what was reached before an error; it holds what the steps before ``first`` returned.
+        """
+        stages = self.stages if fits else {s: [n for n in names if n != "effects"] for s, names in self.stages.items()}
+        with self.environment():
+            return run_steps(state or self.state(), tasks_of(stages, until, first=first), self.settings)
+
+    def calibrated(self) -> UnitState:
+        """Return the unit after the calibration; an error is that whose code, message and file a run publishes."""
+        try:
+            return self.run_to("calibration")
+        except PipelineError:
+            raise
+        except Exception as error:
+            if isinstance(error, OSError) and error.filename is None:
+                raise  # an error of the machine, not of the unit: a full disk
+            raise as_published(error) from error
+
+    @contextmanager
+    def environment(self) -> Iterator[None]:
+        """Have the unit's own effects in the catalogue, and one thread of the linear algebra, as a job of a run has.
+
+        The order of summation, and so the last digits, depend on the number of threads.
+        """
+        effects = self.row.config.user_effects
+        files = UserEffectFiles.model_validate(as_job_reads(effects.json_value)) if effects else NO_EFFECTS
+        with registered(files), threadpool_limits(1, "blas"):
+            yield
+
+
+@dataclass
+class TriedUnit:
+    """A unit after the steps that were tried, and the failure record of a run; None if no step failed."""
+
+    state: UnitState
+    failure: dict[str, Any] | None = None
+
+
+def try_unit(unit: ConfiguredUnit, until: str, *, fits: bool = True) -> TriedUnit:
+    """Run the steps of a unit as a run does, where an error stops only this unit."""
+    state = unit.state()
+    try:
+        return TriedUnit(unit.run_to(until, fits=fits, state=state))
+    except Exception as error:  # noqa: BLE001  (as in a run)
+        return TriedUnit(state, failure_of(error, unit.row.name, state.task))
+
+
+def unit_of_campaign(campaign: Campaign, unit: str) -> ConfiguredUnit:
+    """Return a unit of a campaign, as a run of the campaign configures it."""
+    if unit not in campaign.units:
+        message = f"no unit {unit!r}{nearest(str(unit), campaign.units)}"
+        raise ConfigurationError(message, str(campaign.directory / "units.csv"))
+    batch = next(name for name, units in campaign.batches.items() if unit in units)
+    files = UnitFiles(campaign.recorded, campaign.folder(unit))
+    return ConfiguredUnit(campaign.units[unit], files, campaign.chains[batch], campaign.run_settings(unit))
+
+
+def notes_of_campaign(campaign: Campaign, unit: str) -> list[str]:
+    """Return what a run of the campaign takes from other units, and a unit alone does not."""
+    notes = []
+    if campaign.combine:
+        notes.append(f"combine={campaign.combine}: the other units of the campaign were not used")
+    board = campaign.units[unit].row.get("board", "")
+    if board in campaign.boards:
+        notes.append(f"board {board}: the other chips were not used; how they are mounted is not stated")
+    return notes
+
+
+def require_simulated(campaign: Campaign) -> None:
+    """Raise ``MissingInputError`` if the recordings of a campaign are those that its run simulates, and are not there.
+
+    They are not there, either, if the description has changed since: a run then simulates them again.
+    """
+    if campaign.simulation is None:
+        return
+    mark = campaign.recorded / ".snakemake_timestamp"
+    made = next((file.stat().st_mtime for file in (mark, campaign.recorded) if file.exists()), None)
+    if made is None or made < campaign.simulation.stat().st_mtime:
+        reason = "they do not exist" if made is None else f"{campaign.simulation.name} has changed since"
+        message = f"the recordings of campaign {campaign.name} are simulated by its run, and {reason}"
+        results = f"run it: {run_command(campaign.settings)}; a run with other results is named by results=FOLDER"
+        raise MissingInputError(f"{message}; {results}", str(campaign.recorded))
+
+
+def unit_without_campaign(
+    recordings: Recordings, chosen: Mapping[str, str | None], overrides: Sequence[str], python_effects: Paths
+) -> ConfiguredUnit:
+    """Return recordings as a unit; parameters and errors as of ``pipeline.calibrate``.
+
+    ``chosen``: the option of each group, None for its default.
+    """
+    for group, option in chosen.items():
+        if not isinstance(option, str) and (option is not None or group == "sensor"):
+            raise ConfigurationError(f"{group}={option!r}: a name is expected, of a file in configs/{group}")
+    texts = as_list(overrides, "overrides")
+    for text in texts:
+        if key_of(text) in RUN_SETTINGS:
+            raise ConfigurationError(f"{text}: a setting of a run, which one unit does not have; leave it out")
+    files = files_of_effects(python_effects)
+    name, folder = "unit", NO_CAMPAIGN
+    if isinstance(recordings, str | os.PathLike):
+        folder = Path(recordings).resolve()
+        name = name if wrong_name(folder.name) else folder.name
+    layers = [*(f"{group}={option}" for group, option in chosen.items() if option is not None), *texts]
+    row = unit_row(layers, name, files)
+    if folder != NO_CAMPAIGN:
+        _require_recordings(folder)
+        found = UnitFiles(folder, folder)
+        row = replace(row, config=with_sheet(row.config, folder))
+    else:
+        row, found = _of_mapping(row, recordings)
+    return _configured(row, found)
+
+
+def unit_of_recordings(recordings: Sequence[Recording], layers: Sequence[str]) -> ConfiguredUnit:
+    """Return the recordings of a simulation as a unit, configured by overrides; raises ``ConfigurationError``."""
+    return _configured(unit_row(layers), UnitFiles(NO_CAMPAIGN, NO_CAMPAIGN, recordings=tuple(recordings)))
+
+
+def unit_row(layers: Sequence[str], name: str = "unit", python_effects: Sequence[str] = ()) -> UnitRow:
+    """Return a unit without a campaign, as a run composes and checks its configuration from overrides."""
+    try:
+        config = Composer(NO_CAMPAIGN, python_effects, below=Path()).unit(name, layers)
+    except Problem as problem:
+        raise ConfigurationError(f"the configuration is refused: {problem}") from problem
+    return UnitRow(name, {"unit": name}, config, {key: str(value) for key, value in map(parse, layers)})
+
+
+def _configured(row: UnitRow, files: UnitFiles) -> ConfiguredUnit:
+    _, chains = cut_batches({row.name: row}, 1)
+    return ConfiguredUnit(row, files, next(iter(chains.values())))
+
+
+def files_of_effects(python_effects: Paths) -> list[str]:
+    """Return the paths of Python effects as texts."""
+    one = isinstance(python_effects, str | os.PathLike)
+    texts = [os.fspath(p) if isinstance(p, os.PathLike) else p for p in ([python_effects] if one else python_effects)]
+    return as_list(texts, PYTHON, "a list of paths of Python files")
+
+
+def _require_recordings(folder: Path) -> None:
+    """Raise ``InputError`` for a path that is no folder, or is a campaign."""
+    expected = "a folder of recordings is expected, or a mapping of their names to files or DataFrames"
+    if not folder.exists():
+        raise MissingInputError(f"does not exist; {expected}", str(folder))
+    if not folder.is_dir():
+        raise InputError(f"is no folder; {expected}", str(folder))
+    if (folder / "units.csv").is_file():
+        raise InputError("is a campaign; pipeline.calibrate_unit(campaign, unit) calibrates a unit of it", str(folder))
+
+
+def _of_mapping(row: UnitRow, recordings: Any) -> tuple[UnitRow, UnitFiles]:  # noqa: ANN401  (the user's)
+    """Return the unit and its files for recordings that are named one by one; those that are not named are absent."""
+    if not isinstance(recordings, Mapping):
+        kind = type(recordings).__name__
+        raise InputError(
+            "recordings: a folder is expected, or a mapping of names to files or DataFrames, for example "
+            f"{{'recording': frame}}; got {kind}"
+        )
+    procedure = row.config.procedure
+    if procedure.sheet is not None:
+        procedure = procedure.replaced(recordings=sheet_of_mapping(recordings))
+        recordings = {name: recording for name, recording in recordings.items() if name != SHEET}
+    known = procedure.recordings
+    for name in recordings:
+        if name not in known:
+            raise ConfigurationError(
+                f"no recording of procedure {procedure.name} is called {name!r}{nearest(str(name), known)}"
+            )
+    lacking = [n for n, entry in known.items() if n not in recordings and not entry.optional]
+    if lacking:
+        raise MissingInputError(
+            f"missing recordings: {', '.join(lacking)}; procedure {procedure.name} needs them"
+            f"{of_one_sensor(procedure, recordings)}"
+        )
+    frames = {n: _text_of(n, r) for n, r in recordings.items() if not isinstance(r, str | os.PathLike)}
+    paths = {n: str(Path(r).resolve()) for n, r in recordings.items() if n not in frames}
+    columns = row.config.ingest.csv.get("columns")
+    if frames and not paths and columns and columns != load_profile(CANONICAL_CSV).csv["columns"]:
+        message = "describes columns of files; a DataFrame has those of the canonical CSV: leave out the setting"
+        raise ConfigurationError(f"ingest={row.config.ingest.name} {message} of ingest")
+    entries = {n: e.replaced(file=paths.get(n, e.file)) for n, e in known.items() if n in recordings}
+    of_unit = procedure.replaced(recordings=entries)
+    for name, candidates in candidate_files(of_unit, row.config.ingest).items():
+        if name not in paths or any(os.path.exists(file) for files in candidates for file in files):  # noqa: PTH110
+            continue
+        if Path(paths[name]).is_dir():
+            raise InputError(f"recording {name}: is a folder; a file is expected", paths[name])
+        message = f"recording {name}: there is no such file (tried {tried(candidates)})"
+        raise MissingInputError(message, paths[name])
+    files = UnitFiles(NO_CAMPAIGN, NO_CAMPAIGN, in_memory=frames)
+    return replace(row, config=row.config.replaced(procedure=of_unit)), files
+
+
+def _text_of(name: str, recording: Any) -> bytes:  # noqa: ANN401  (the user's)
+    """Return a DataFrame as canonical CSV; raises ``InputError`` for any other object."""
+    import pandas as pd  # noqa: PLC0415  (0.4 s, for DataFrames only)
+
+    from imu_logs.text_write import canonical_csv  # noqa: PLC0415  (likewise)
+
+    if not isinstance(recording, pd.DataFrame):
+        kind = type(recording).__name__
+        raise InputError(f"recording {name}: the path of a file or a pandas DataFrame is expected; got {kind}")
+    return canonical_csv(f"{name} {IN_MEMORY}", recording)

@@ -1,0 +1,302 @@
+"""Plan a procedure: simulate it without effects, and state which size of each effect it would find.
+
+    {"sensor", "table", "procedure", "course": {how it is run}, "at_a_table", "minutes", "samples", "warnings": [text],
+     "accelerometer": {"noise": {"white", "wander"}, "unit",
+        "effects": [{"effect", "smallest", "unit", "share_of_limit", "almost_sure", "named", "sizes", "taken_for",
+                      "look_alikes": [{"effect", "share"}]}],
+        "not_observable": [{"effect", "reason"}], "reason": null | why nothing can be planned},
+     "gyroscope": {...}}
+
+Sizes are those that half of the units would show. An effect that needs a size above its limit is not observable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.evaluation.diagnosis.multi_position import require_model
+from pipeline.evaluation.diagnosis.observability import at_its_limit, not_observable, not_observable_by_hand
+from pipeline.core.errors import NotObservableError
+from pipeline.estimation.multi_position import selection as by_hand
+from pipeline.estimation.observations import observe
+from pipeline.estimation.rest_means import is_multi_position
+from pipeline.estimation.selection import select
+from pipeline.physics.effects import effect
+from pipeline.physics.effects.base import unit_of
+from pipeline.physics.sensor_file import assumed_figures
+from pipeline.app.planning.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
+from pipeline.core.records import SENSORS, Noise, NotCalibrated, Recording, SensorCalibration
+from pipeline.output.pages.pages import template
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription, course_of, shipped_settings
+from pipeline.unit import run_checked
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping, Sequence
+
+    from pipeline.core.records import Fit
+    from pipeline.core.settings import DataSheet, Settings
+    from pipeline.simulation.trajectory import Planned
+
+WIDTH = 100  # columns of a plan on the terminal
+CLEARLY_LARGER = 1.2  # times the smallest size: least size of a named effect that is printed
+SEED = 0  # of the simulated noise, so that a plan is reproducible
+# The middle of the random values of a simulated unit, which warms up by some degrees in a room that changes little.
+ROOM: dict[str, Any] = {
+    "ambient": 25.0, "warm_up": 4.5, "warm_up_time": 300.0, "drift": 0.3,
+    "periods": np.array([3000.0, 5000.0]), "phases": np.zeros(2),
+}  # fmt: skip
+FAULTLESS: dict[str, Any] = {"angle_accuracy_deg": 0.0, "rate_error": [0.0] * 3, "direction_deg": np.zeros((3, 2))}
+Document = dict[str, Any]
+
+
+def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: bool = False) -> Document:
+    """Return the plan of a unit's procedure with further recordings.
+
+    With ``half_only``, ``almost_sure`` and ``named`` are None. Raises ``ConfigurationError`` if a name is unknown or
+    the course is impossible.
+    """
+    simulated = simulate_procedure(unit, extra)
+    return {
+        "sensor": unit.sensor,
+        "table": unit.table,
+        "procedure": unit.procedure,
+        "course": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(course_of(unit)).items()},
+        "at_a_table": simulated.settings.table.motion != "none",
+        "minutes": simulated.minutes,
+        "samples": sum(r.samples for r in simulated.recordings),
+        "warnings": _warnings(simulated),
+        **{sensor: of_sensor(sensor, simulated, half_only=half_only) for sensor in SENSORS},
+    }
+
+
+def not_shown(unit: UnitDescription, effects: Sequence[str]) -> dict[str, str]:
+    """Return the effects of a simulation that the unit's procedure cannot show, with the reason.
+
+    ``effects``: ``sensor.effect``, or ``effect`` for all its sensors; the latter is shown if one sensor shows it.
+    """
+    wanted: dict[str, dict[str, str]] = {}  # effect as given: its sensors, with the name
+    for key in effects:
+        sensor, _, name = key.rpartition(".")
+        wanted[key] = dict.fromkeys([s for s in effect(name).sensors if sensor in (s, "")], name)
+    simulated, reasons = simulate_procedure(unit), dict[str, dict[str, str]]()
+    for sensor in {sensor for of_key in wanted.values() for sensor in of_key}:
+        names = {of_key[sensor] for of_key in wanted.values() if sensor in of_key}
+        document = of_sensor(sensor, simulated, half_only=True, only=names)
+        hidden = {entry["effect"]: entry["reason"] for entry in document["not_observable"]}
+        reasons[sensor] = dict.fromkeys(names, str(document["reason"])) if document["reason"] else hidden
+    found = {}
+    for key, of_key in wanted.items():
+        lacking = {sensor: reasons[sensor][name] for sensor, name in of_key.items() if name in reasons[sensor]}
+        if lacking and len(lacking) == len(of_key):
+            found[key] = "; ".join(dict.fromkeys(lacking.values()))
+    return found
+
+
+def of_sensor(
+    sensor: str, simulated: SimulatedProcedure, *, half_only: bool = False, only: Collection[str] | None = None
+) -> Document:
+    """Return the plan of one sensor; ``only``: of some effects."""
+    noise = simulated.noise[sensor]
+    document: Document = {
+        "unit": unit_of(sensor),
+        "noise": {"white": float(noise.white[0]), "wander": float(noise.wander[0])},
+        "effects": [],
+        "not_observable": [],
+        "reason": None,
+    }
+    limits: DetectionLimits
+    try:
+        if is_multi_position(sensor, simulated.recordings):
+            by_rests = select_by_hand(sensor, simulated)
+            limits, hidden = RestLimits(by_rests, noise), not_observable_by_hand(by_rests, [])
+        else:
+            observations = observe(sensor, simulated.recordings, simulated.settings.table)
+            selection = select(observations, [], noise, simulated.settings.sensor.of(sensor), search=False)
+            limits, hidden = TurntableLimits(selection, noise), not_observable(selection, [])
+    except NotObservableError as error:
+        return {**document, "reason": error.message}
+    for name in sorted(set(limits.names if only is None else only) & set(limits.names) - set(hidden)):
+        detection = limits.detection(name, half_only=half_only)
+        limited = bool(np.isfinite(limits.limits[name]).any())
+        if limited and detection.found > 1.0:
+            this, times = effect(name), f", {detection.found:.2g} times that would show"
+            faint = at_its_limit(this, sensor, detection.unit_sizes[0]) + " be below the noise"
+            hidden[name] = f"{faint}{times if np.isfinite(detection.found) else ''}; it needs {this.excitation}"
+        else:
+            document["effects"].append(_entry(sensor, detection, limited=limited))
+    document["not_observable"] = [{"effect": n, "reason": hidden[n]} for n in sorted(hidden)]
+    return document
+
+
+def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.SelectionByHand:
+    """Return the selection in a simulated procedure by hand.
+
+    Raises ``NotObservableError`` if bias and matrix cannot be determined, or if there are no rests.
+    """
+    start, other = simulated.accelerometer_by_hand, None
+    if isinstance(start, NotCalibrated):
+        raise NotObservableError(start.reason)
+    if sensor == "gyroscope":
+        start, other = SensorCalibration(sensor), start
+    model = require_model(simulated.recordings, start, simulated.noise[sensor], simulated.settings, other)
+    return by_hand.SelectionByHand(model, start, [], simulated.noise[sensor], simulated.settings.sensor.of(sensor))
+
+
+def _entry(sensor: str, detection: Detection, *, limited: bool) -> Document:
+    parameters = effect(detection.effect).parameters(sensor)
+    first = float(detection.unit_sizes[0])
+    almost_sure, named = (
+        share * first if np.isfinite(share * first) else None for share in (detection.sure, detection.named)
+    )
+    return {
+        "effect": detection.effect,
+        "smallest": detection.found * first,
+        "unit": parameters[0].unit,
+        "share_of_limit": detection.found if limited else None,
+        "almost_sure": almost_sure,
+        "named": named,
+        "sizes": {
+            p.name: detection.found * float(u) for p, u in zip(parameters, detection.unit_sizes, strict=True) if u
+        },
+        "taken_for": detection.taken_for,
+        "look_alikes": [{"effect": name, "share": share} for name, share in detection.look_alikes.items()],
+    }
+
+
+@dataclass(frozen=True)
+class SimulatedProcedure:
+    """The recordings of a procedure with a faultless sensor and table, and the configurations and noise of both."""
+
+    recordings: list[Recording]
+    settings: Settings
+    noise: dict[str, Noise]
+    minutes: float  # from power-on to the end of the last recording
+
+    @cached_property
+    def accelerometer_by_hand(self) -> Fit:
+        """The fit of the accelerometer to rests."""
+        stages = {"accelerometer": ["nonlinear_least_squares"]}
+        return run_checked(self.recordings, stages, self.settings).fits["accelerometer"]
+
+
+def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> SimulatedProcedure:
+    """Simulate a procedure and further recordings without the unit's effects and the table's imperfections.
+
+    Raises ``ConfigurationError`` if sensor, table or procedure are unknown, or the course is impossible.
+    """
+    faultless = replace(
+        unit, effects={}, imperfections=FAULTLESS, held_out={}, temperature={**ROOM, **unit.temperature}
+    )
+    recordings, _ = simulate_unit(faultless, SEED, 0, extra)
+    settings = shipped_settings(sensor=unit.sensor, table=unit.table, procedure=unit.procedure)
+    long_rest = any(recording.role == "static" for recording in recordings)
+    noise = {s: stated_noise(settings.sensor.of(s), unit.interval_s, long_rest=long_rest) for s in SENSORS}
+    minutes = max(float(r.time[-1]) for r in recordings) / 60.0
+    return SimulatedProcedure(recordings, settings, noise, minutes)
+
+
+def stated_noise(data_sheet: DataSheet, interval: float, *, long_rest: bool) -> Noise:
+    """Return the noise of a sensor by the sensor file.
+
+        white^2 = noise_density^2 / (2 dt) + (1 / counts_per_unit)^2 / 12
+
+    with the sampling interval dt in s, the one-sided density in unit/sqrt(Hz), and the quantisation. ``long_rest``:
+    whether a long rest will determine the noise.
+    """
+    quantisation = 1.0 / (12.0 * data_sheet.counts_per_unit**2)
+    white = np.sqrt(data_sheet.noise_density**2 * 0.5 / interval + quantisation)
+    wander = np.full(3, data_sheet.bias_wander)
+    return Noise(np.full(3, white), wander, data_sheet.wander_time_s, "static" if long_rest else "rests")
+
+
+def _warnings(simulated: SimulatedProcedure) -> list[str]:
+    """Return the limitations of sensor and table in the procedure, and the assumed figures, as sentences."""
+    full = simulated.settings.sensor.gyroscope.full_scale
+    rates = [float(np.abs(r.table_rate).max()) for r in simulated.recordings if r.table_rate is not None]
+    fastest, assumed = max(rates, default=0.0), assumed_figures(simulated.settings.sensor)
+    found = [assumed] if assumed else []
+    if fastest > full:
+        found.append(f"the fastest turn, {fastest:g} deg/s, is beyond the gyroscope's full scale of {full:g} deg/s")
+    if simulated.settings.table.motion == "commanded":
+        angle = simulated.settings.table.angle_accuracy_deg
+        found.append(
+            f"the table logs its program, not its motion: angle errors of {angle:g} deg read as "
+            f"{1000.0 * np.radians(angle):.2g} mg, and sizes below that are only found if they repeat from stop to stop"
+        )
+    return found
+
+
+def plan_text(document: Document, second: Document | None = None) -> list[str]:
+    """Return a plan (``plan_of``) as lines, or two plans side by side."""
+    text: str = template("plan.txt").render(
+        first=document,
+        second=second,
+        sensors=SENSORS,
+        rows=_rows,
+        hidden=lambda part: [[entry["effect"], entry["reason"]] for entry in part["not_observable"]],
+        both=_compared,
+        width=WIDTH,
+    )
+    return [part for line in text.splitlines() for part in ([line] if len(line) <= WIDTH else wrap(line, WIDTH))]
+
+
+def _rows(part: Mapping[str, Any]) -> list[list[str]]:
+    """Return the plan of a sensor as a table; empty if no effect is observable."""
+    rows = [
+        [
+            entry["effect"],
+            size_text(entry["smallest"], entry["unit"]),
+            share_text(entry["share_of_limit"]),
+            "; ".join(filter(None, [_alike(entry), _note(entry)])),
+        ]
+        for entry in part["effects"]
+    ]
+    return [["effect", "smallest size", "of limit", "similar signal; what would be named"], *rows] if rows else []
+
+
+def _alike(entry: Mapping[str, Any]) -> str:
+    return ", ".join(f"{a['effect']} {a['share']:.2f}" for a in entry["look_alikes"][:2])
+
+
+def _note(entry: Mapping[str, Any]) -> str:
+    """Return the size below which another effect would be named."""
+    named, smallest, taken = entry["named"], entry["smallest"], entry["taken_for"]
+    limit = None if entry["share_of_limit"] is None else smallest / entry["share_of_limit"]
+    never = named is None or (limit is not None and named > limit)
+    if taken:
+        return f"named as {taken}" + ("" if never else f" below {size_text(named, entry['unit'])}")
+    if never:
+        return "not distinguishable from those"
+    return f"named from {size_text(named, entry['unit'])}" if named > CLEARLY_LARGER * smallest else ""
+
+
+def size_text(value: float, unit: str) -> str:
+    """Return a size with its unit."""
+    return f"{value:.2g}" + ("" if unit == "1" else f" {unit}")
+
+
+def share_text(value: float | None) -> str:
+    """Return a share of a limit in per cent."""
+    if value is None:
+        return "no limit"
+    return f"{100.0 * value:.2g} %" if value >= 1e-3 else "< 0.1 %"
+
+
+def _compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[list[str]]:
+    """Return two plans of a sensor as a table; empty without effects."""
+    a, b = ({entry["effect"]: entry for entry in part["effects"]} for part in (first, second))
+    rows = []
+    hidden = {e["effect"] for part in (first, second) for e in part["not_observable"]}
+    for name in sorted(a.keys() | b.keys() | hidden):
+        cells = [name]
+        for e in (a.get(name), b.get(name)):
+            cells += [size_text(e["smallest"], e["unit"]), share_text(e["share_of_limit"])] if e else ["-", ""]
+        both = name in a and name in b
+        rows.append([*cells, f"{b[name]['smallest'] / a[name]['smallest']:.2f}" if both else ""])
+    return [["effect", "smallest in A", "of limit", "smallest in B", "of limit", "B / A"], *rows] if rows else []

@@ -1,0 +1,348 @@
+"""Describe a recording in lines for the terminal: time, channels, rests, clipping, units, notes and topics."""
+
+from __future__ import annotations
+
+import textwrap
+from contextlib import suppress
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from imu_logs.files import MESSAGE_FORMATS, kind_of
+from imu_logs.guesses import BURST_INTERVAL_DIFFERENCE
+from imu_logs.mcap_file import McapReader
+from imu_logs.message_decoder import ARRAYS, KINDS, object_decoder, ros_layouts
+from imu_logs.message_layout import short_name
+from imu_logs.message_logs import open_reader
+from imu_logs.message_read import LONGEST_ARRAY
+from imu_logs.units import DEGREES, TRIADS
+from pipeline.core.errors import IngestError
+from pipeline.ingest.gravity_rotation import FAILS_DEG, FITS_DEG, misfit_deg, moves_of, rests_of
+from pipeline.ingest.quality_flags import CLIPPED, GAP, REST_LIMITS, STUCK, equal_share
+from pipeline.checks.bench import other_axes
+from pipeline.app.profile_detection.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
+from pipeline.core.records import AXES, SENSOR_UNITS, SENSORS
+from pipeline.physics.signal.rests import SHORTEST_REST_S, rests_from_table, runs
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from mcap.records import Channel, Schema
+
+    from pipeline.ingest.gravity_rotation import MoveByHand
+    from pipeline.core.records import Note, Recording, Values
+    from pipeline.core.settings import Sensor
+
+MAX_SEARCHED_SAMPLES = 500_000  # searched for rests and moves
+MIN_VARIANCE_SAMPLES = 3  # of a rest, for a variance
+PLATEAU = 3  # samples at the largest value; noise repeats it less often
+DECISIVE_RATIO = 2.0  # of the misfits of two units of the rates, from which the moves determine the unit
+LABEL_WIDTH = 16  # width of the labels, characters
+WIDTH = 118  # characters of a line
+LISTED_NOTES = 20  # fit one screen; the others are counted
+LONGEST_LIST = 4  # elements of an array that are listed
+MAX_LISTED_FIELDS = 24  # of a message that are listed
+MOST_TOPICS = 20  # with a line each
+
+Line = tuple[str, str]
+
+
+def facts(recording: Recording, sensor: Sensor | None = None) -> list[Line]:
+    """Return the description of a recording as pairs of label and text; ``sensor`` has the full scales."""
+    rests = _rests(recording)
+    lines = [("time", _time(recording))]
+    for name in SENSORS:
+        readings = recording.reading(name)
+        lines.append((name, "none" if readings is None else _sensor(name, readings, rests)))
+    if recording.temperature is not None:
+        low, high = float(recording.temperature.min()), float(recording.temperature.max())
+        lines.append(("temperature", f"{low:.4g} to {high:.4g} degC" if high > low else f"{low:.4g} degC throughout"))
+    lines += _table(recording)
+    lines.append(("rests", _describe_rests(recording, rests)))
+    lines.append(("clipping", _clipping(recording, sensor)))
+    lines += _units(recording, rests)
+    lines += [("notes" if i == 0 else "", text) for i, text in enumerate(_notes(recording.notes))]
+    return lines
+
+
+def as_text(lines: Sequence[Line]) -> str:
+    """Return pairs of label and text as wrapped lines in two columns."""
+    wrapped = []
+    for label, text in lines:
+        first = f"  {label:<{LABEL_WIDTH}}"
+        wrapped += textwrap.wrap(
+            text,
+            WIDTH,
+            initial_indent=first,
+            subsequent_indent=" " * len(first),
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    return "\n".join(wrapped)
+
+
+def _time(recording: Recording) -> str:
+    interval, time = recording.interval, recording.time_ns
+    span = float(time[-1] - time[0]) / 1e9
+    jitter = float(np.std(np.diff(time) / 1e9)) / interval
+    mean = span / max(recording.samples - 1, 1)
+    rate, median = f"{1 / interval:.6g} Hz", f"{_number(interval * 1e3)} ms"
+    bursty = abs(mean / interval - 1.0) > BURST_INTERVAL_DIFFERENCE
+    rate = f"{1 / mean:.6g} Hz on average ({rate} by the median interval of " if bursty else f"{rate} (median interval "
+    rate += median
+    text = f"{recording.samples:,} rows over {_number(span)} s at {rate}), from {_number(float(time[0]) / 1e9)} s"
+    gaps = 0 if recording.flags is None else int(np.count_nonzero(recording.flags & GAP))
+    if gaps:
+        return f"{text}; {gaps} gap{'s'[: gaps > 1]} (see the notes)"
+    return text + ("; no gaps" + (f", intervals scatter by {jitter:.1%}" if jitter > 0.01 else ""))
+
+
+def _rests(recording: Recording) -> list[tuple[int, int]]:
+    turns = _turns(recording)
+    by_table = rests_from_table(recording) if turns else []
+    if by_table:
+        return [(r.start, r.stop) for r in by_table if r.stop - r.start >= MIN_VARIANCE_SAMPLES]
+    force = recording.accelerometer
+    if force is None or recording.samples < 20 or (turns and recording.table_rate is not None):
+        return []
+    return rests_of(force[:MAX_SEARCHED_SAMPLES], recording.interval)
+
+
+def _turns(recording: Recording) -> bool:
+    """Return whether the log of the table changes; the log of an unconnected encoder does not."""
+    return any(log is not None and np.ptp(log) > 0.0 for log in (recording.table_angle, recording.table_rate))
+
+
+def _sensor(name: str, readings: Values, rests: Sequence[tuple[int, int]]) -> str:
+    unit = SENSOR_UNITS[name]
+    spans = [f"{a} {_number(v.min())} to {_number(v.max())}" for a, v in zip(AXES, readings.T, strict=True)]
+    text = f"{', '.join(spans)} {unit}"
+    if not rests:
+        return text
+    means = np.array([readings[a:b].mean(axis=0) for a, b in rests])
+    noise = np.sqrt(np.median([np.var(np.diff(readings[a:b], axis=0), axis=0) / 2 for a, b in rests], axis=0))
+    if name == "accelerometer":
+        size = np.linalg.norm(means, axis=1)
+        between = f" ({_number(size.min())} to {_number(size.max())})" if len(rests) > 1 else ""
+        text += f"; at rest |a| = {_number(float(np.median(size)))} {unit}{between}"
+    else:
+        usual = np.median(means, axis=0)
+        text += f"; at rest {', '.join(_number(v) for v in usual)}"
+        if np.abs(usual).max() > REST_LIMITS[name]:
+            text += f", more than the {REST_LIMITS[name]:g} {unit} of consumer sensors: check the unit"
+    return f"{text}, noise {_number(float(np.median(noise)), 2)} a sample"
+
+
+def _table(recording: Recording) -> list[Line]:
+    texts = []
+    if recording.table_angle is not None:
+        low, high = float(recording.table_angle.min()), float(recording.table_angle.max())
+        texts.append(f"angle {_number(low)}{f' to {_number(high)}' if high > low else ''} deg")
+    if recording.table_rate is not None:
+        rate = recording.table_rate
+        text = f"rate {_number(float(rate.min()))} to {_number(float(rate.max()))} deg/s"
+        if recording.gyroscope is not None and np.ptp(rate) > 1.0:
+            correlations = [float(np.corrcoef(rate, w)[0, 1]) if np.ptp(w) else 0.0 for w in recording.gyroscope.T]
+            axis = int(np.argmax(np.abs(correlations)))
+            if abs(correlations[axis]) > 0.9:
+                slope = float(np.polyfit(rate, recording.gyroscope[:, axis], 1)[0])
+                text += f" (the gyroscope's {AXES[axis]} reads {slope:.3f} of it, correlation {correlations[axis]:.4f})"
+        texts.append(text if np.any(rate) else "rate 0 deg/s")
+    if recording.table_attitude is not None:
+        texts.append("attitude")
+    clock = recording.source.get("table_clock")
+    if clock:
+        texts.append(f"a separate clock, {clock['offset_s']:.6g} s ahead and gaining {clock['drift_ppm']:.3g} ppm")
+    if texts and recording.table_attitude is None and not _turns(recording):
+        texts.append("it does not change: the table did not turn, or its encoder is not connected")
+    return [("table", "; ".join(texts))] if texts else []
+
+
+def _describe_rests(recording: Recording, rests: Sequence[tuple[int, int]]) -> str:
+    if not rests:
+        return "none found"
+    lengths = np.array([b - a for a, b in rests]) * recording.interval
+    if len(rests) == 1:
+        whole = rests[0][1] - rests[0][0] > 0.9 * recording.samples
+        return f"1, of {_number(lengths[0], 3)} s" + (": the sensor did not move" if whole else "")
+    text = f"{len(rests)}, {_number(lengths.min(), 2)} to {_number(lengths.max(), 3)} s long"
+    short = int(np.count_nonzero(lengths < SHORTEST_REST_S))
+    by_hand = recording.role == "rests" and not _turns(recording)
+    return text + (
+        f"; {short} of them are shorter than {SHORTEST_REST_S:g} s, and a run does not use them"
+        * (by_hand and short > 0)
+    )
+
+
+def _clipping(recording: Recording, sensor: Sensor | None) -> str:
+    """Describe the readings at full scale or, if that is unknown, the readings that stay at their largest value."""
+    full_scale = {s: sensor.of(s).full_scale if sensor else None for s in SENSORS}
+    flags = recording.flags
+    texts = []
+    for name in SENSORS:
+        readings = recording.reading(name)
+        if readings is None:
+            continue
+        if full_scale[name] is not None:
+            largest = float(np.abs(readings).max())
+            texts.append(f"{name} up to {_number(largest)} of {full_scale[name]:g} {SENSOR_UNITS[name]}")
+            continue
+        for channel, values in zip(TRIADS[name], readings.T, strict=True):
+            texts += [f"{channel} stays at {text}: clipped?" for text in _plateaus(values)]
+    clipped = 0 if flags is None else int(np.count_nonzero(flags & CLIPPED))
+    stuck = 0 if flags is None else int(np.count_nonzero(flags & STUCK))
+    if all(full_scale.values()):
+        texts.append(f"{clipped} rows at full scale" if clipped else "none at full scale")
+    elif not texts:
+        texts.append("no reading stays at its largest value (--sensor NAME compares with a full scale)")
+    return "; ".join([*texts, *([f"{stuck} rows stuck"] if stuck else [])])
+
+
+def _plateaus(values: Values) -> list[str]:
+    """Describe the plateaus of a channel at its largest and smallest value, which indicate clipping."""
+    same = values[1:] == values[:-1]
+    if same.mean() > 0.5 or equal_share(same) > 0.5:
+        return []  # too coarse or too quiet to decide
+    texts = []
+    for extreme in (values.max(), values.min()):
+        equal = values == extreme
+        longest = max((b - a for a, b in runs(equal)), default=0)
+        if longest >= PLATEAU:
+            texts.append(f"{_number(float(extreme))} for {longest} samples ({int(equal.sum())} in all)")
+    return texts
+
+
+def _units(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[Line]:
+    """State whether the integrated rates agree with the rotation of gravity between rests."""
+    if recording.accelerometer is None or recording.gyroscope is None or recording.samples < 20:
+        return []
+    part = slice(0, MAX_SEARCHED_SAMPLES)
+    force = recording.accelerometer[part]
+    means = [force[a:b].mean(axis=0) for a, b in rests]
+    centre = sphere(np.array(means))[0] if len(means) >= FEWEST_RESTS_FOR_A_SPHERE else np.zeros(3)
+    moves = moves_of(force - centre, recording.gyroscope[part], recording.time[part])
+    if moves:
+        return [("units", _rates_and_gravity(moves))]
+    if recording.table_rate is not None:
+        return []
+    return [("units", "no move between rests turns gravity, so the unit of the rates cannot be checked")]
+
+
+def _rates_and_gravity(moves: Sequence[MoveByHand]) -> str:
+    """State the misfit of the integrated rates to the rotation of gravity, also for other units and other axes."""
+    scales = (1.0, DEGREES, 1 / DEGREES)
+    declared, *others = misfit_deg(moves, scales)
+    best = int(np.argmin(others))
+    angle, way = np.median([(m.angle_deg, m.way) for m in moves], axis=0)
+    over = f"{counted(len(moves), 'move')} that turn{'s' * (len(moves) == 1)} it by {angle:.0f} deg (medians)"
+    axes = other_axes(moves)
+    if axes is not None:
+        return f"accelerometer and gyroscope contradict each other: {axes[0]}: check the order and signs of the axes"
+    if declared <= FAILS_DEG and DECISIVE_RATIO * declared <= others[best]:
+        return (
+            f"the rates agree with the rotation of gravity to within {declared:.2g} deg in {over}; that is "
+            f"{declared / way:.1%} of the {way:.0f} deg turned through, with uncalibrated scale factors and biases; "
+            f"in another unit the rates miss by {others[best]:.0f} deg"
+        )
+    if others[best] <= FITS_DEG and DECISIVE_RATIO * others[best] <= declared:
+        return (
+            f"check the unit of the rates: multiplied by {scales[1 + best]:.4g} they turn gravity to within "
+            f"{others[best]:.2g} deg in {over}, as declared to within {declared:.2g} deg"
+        )
+    return (
+        f"the moves do not determine the unit of the rates: as declared they turn gravity to within {declared:.2g} deg "
+        f"in {over}, in another unit to within {others[best]:.2g} deg"
+    )
+
+
+def _notes(notes: Sequence[Note]) -> list[str]:
+    lines = []
+    for note in notes[:LISTED_NOTES]:
+        count = f" x {note.count}" if note.count > 1 else ""
+        last = f" to {note.last}" if note.last != note.first else ""
+        place = f", line {note.first}{last}" if note.first else ""
+        detail = note.detail.rpartition("; ")[2] if note.settings else note.detail  # ``check`` prints them once
+        lines.append(f"{note.code}{count}{place}: {detail}")
+    return (lines + [f"and {len(notes) - LISTED_NOTES} more"] * (len(notes) > LISTED_NOTES)) or ["none"]
+
+
+def _number(value: float, digits: int = 4) -> str:
+    text = f"{value:.{digits}g}"
+    return f"{value:.0f}" if "e" in text and 1 <= abs(value) < 1e7 else text
+
+
+def topic_lines(path: Path, *, fields: bool) -> list[Line]:
+    """Return the content of a message log as pairs of label and text; empty if it cannot be read.
+
+    ``fields``: whether to list the fields of messages of unknown types.
+    """
+    first: dict[int, bytes] = {}
+    try:
+        with open_reader(path) as reader:
+            for rows in reader.rows():
+                if rows.channel not in first:
+                    first[rows.channel] = rows.payload(0)
+    except (IngestError, OSError):
+        with suppress(OSError), path.open("rb") as stream:
+            kind = kind_of(stream.read(18)).partition(":")[0]
+            return [("kind", f"{kind}, by its first bytes")] if kind else []
+        return []
+    size, proof = counted(reader.count, "message"), "integrity: not_verifiable, without checksums"
+    if isinstance(reader, McapReader):
+        library = f", written by {reader.header.library}" if reader.header and reader.header.library else ""
+        proof = "every checksum and count verified" if reader.verified else proof
+        container = f"{size} in {counted(len(reader.chunks), 'chunk')}{library}; {proof}"
+    else:
+        container = f"{MESSAGE_FORMATS[path.suffix.lower()].kind} with {size}; {proof}"
+    lines = [("container", container)]
+    if len(reader.channels) > MOST_TOPICS:
+        return [*lines, ("topics", ", ".join(f"{c.topic} ({reader.counts[n]})" for n, c in reader.channels.items()))]
+    for number, channel in reader.channels.items():
+        schema = reader.schemas.get(channel.schema_id)
+        kind = f"{schema.name}, {channel.message_encoding}" if schema else channel.message_encoding or "no encoding"
+        text = f"{channel.topic} ({kind}): {counted(reader.counts[number], 'message')}"
+        if fields and number in first and not (schema and short_name(schema.name) in KINDS):
+            text += _fields(channel, schema, first[number])
+        lines.append(("topic", text))
+    return lines
+
+
+def counted(number: int, what: str) -> str:
+    """Return a number with its noun, in the plural except for 1."""
+    return f"{number:,} {what}{'s'[: number != 1]}"
+
+
+def _fields(channel: Channel, schema: Schema | None, payload: bytes) -> str:
+    """Return the paths of the numbers in a message, for the fields of a profile."""
+    try:
+        find_layout, decode = ros_layouts(channel, schema), object_decoder(channel, schema)
+        longest = LONGEST_ARRAY if schema is not None and schema.encoding == ARRAYS else LONGEST_LIST
+        names = find_layout(payload).elements(longest) if find_layout else _numbers(decode and decode(payload), "")
+        paths = list(islice(names, MAX_LISTED_FIELDS + 1))
+    except Exception:  # noqa: BLE001  (a decoder may raise anything for an unknown message: nothing is listed)
+        return ""
+    more = " .." if len(paths) > MAX_LISTED_FIELDS else ""
+    return f", with {', '.join(paths[:MAX_LISTED_FIELDS])}{more}" if paths else ""
+
+
+def _numbers(value: Any, path: str) -> Iterator[str]:  # noqa: ANN401  (a message of any decoder)
+    """Yield the paths of the numbers in a decoded message."""
+    if isinstance(value, bool | str | bytes):
+        return
+    if hasattr(value, "__float__"):
+        yield path
+        return
+    if hasattr(value, "DESCRIPTOR"):
+        children = {f.name: getattr(value, f.name) for f in value.DESCRIPTOR.fields}
+    elif isinstance(value, dict):
+        children = value
+    elif hasattr(value, "__len__"):
+        for index in range(min(len(value), LONGEST_LIST)):
+            yield from _numbers(value[index], f"{path}[{index}]")
+        return
+    else:
+        children = getattr(value, "__dict__", {})
+    for name, child in children.items():
+        yield from _numbers(child, f"{path}.{name}" if path else name)

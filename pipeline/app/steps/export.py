@@ -1,0 +1,17 @@
+"""Step export: write the calibration in the formats of other tools."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pipeline.output.exports import exports
+
+if TYPE_CHECKING:
+    from pipeline.core.settings import Settings
+
+
+def export(
+    calibration: dict[str, Any], validation: dict[str, Any], diagnosis: dict[str, Any], settings: Settings
+) -> dict[str, str]:
+    """Return the files of ``exports/<unit>/`` by name."""
+    return exports(calibration, settings, validation, diagnosis)

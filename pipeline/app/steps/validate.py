@@ -1,0 +1,44 @@
+"""Step validate: compute the errors on held-out motion, and the noise floors."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.estimation.noise import required_noises
+from pipeline.core.records import SensorValidation, Validation, calibrated
+from pipeline.evaluation.held_out.attitude import attitude, gravity_direction
+from pipeline.evaluation.held_out.heldout import validate
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.core.records import Fit, UnitRecordings
+    from pipeline.core.settings import Settings
+
+
+def validate_unit(unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings) -> Validation:
+    """Return the errors on held-out motion after each step of both fits."""
+    filtered, found = recordings.filtered, calibrated(fits)
+    noise = recordings.noises.get("gyroscope")
+    return Validation(
+        unit,
+        held_out_errors(recordings, fits, settings),
+        attitude(found["accelerometer"], found["gyroscope"], filtered),
+        gravity_direction(**found, recordings=filtered, noise=noise, procedure=settings.procedure),
+    )
+
+
+def held_out_errors(
+    recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings
+) -> dict[str, SensorValidation | None]:
+    """Return the errors of each sensor; None for a sensor without a calibration."""
+    known = calibrated(fits)
+    noises = required_noises(recordings, settings.sensor, known)
+    found: dict[str, SensorValidation | None] = {}
+    for sensor, calibration in known.items():
+        other = next(c for s, c in known.items() if s != sensor)
+        if calibration is None:
+            found[sensor] = None
+        else:
+            found[sensor] = validate(calibration, recordings.filtered, noises[sensor], settings, other=other)
+    return found

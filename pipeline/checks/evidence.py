@@ -1,0 +1,238 @@
+"""The rotation of a recording by each of its channels, in one form, so that they can be compared.
+
+A table's angle or attitude gives the exact mean rate over the interval between two samples. A logged rate and a
+gyroscope give the rate at the samples. Scales are compared by the weighted median of ratios. Its weights are cut off,
+so that a few spikes do not change it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.core.errors import IngestError
+from pipeline.ingest.quality_flags import GAP_INTERVALS
+from pipeline.core.records import AXES, SENSORS, conjugate_product, continuous, median, noise_of_steps, once, once_of_log
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.core.records import Mask, Recording, Values
+    from pipeline.core.settings import Settings
+
+
+EXPANDED = 3.0  # coverage of a stated standard uncertainty: 99.7 % of a normal distribution
+OPPOSITE = 0.8  # correlation from which two channels differ in sign alone
+SIGN_BLOCK = 8  # intervals over which both channels show the angle of a short move
+SAMPLED = 0.05  # relative error of an angle summed up from the rate in moves of some samples (1.6 % in 3 deg)
+LEAST_TURN_DEG = 60.0  # for gravity to determine an angle: biases of 0.1 g distort its phase by 6 deg
+LEAST_SWING_G = 0.5  # radius of gravity's circle from which the axis is level
+FASTEST_DEG = 90.0  # in one interval, beyond which the phase may lose a turn
+LEAST_RATE_DPS = 1.0  # change of a rate from which it determines the gyroscope's scale
+
+
+@dataclass(frozen=True)
+class ChannelLimits:
+    """How much an effect of the catalogue may make channels differ, and the names of channels in the files."""
+
+    late_s: float  # time_offset and low_pass_lag
+    clock: float  # relative
+    rate: float  # relative
+    rate_stated: float  # relative: three times the stated standard uncertainty of the table's rate
+    angle_deg: float
+    angle_stated_deg: float
+    gain: float  # relative, of a gyroscope by its sensor file
+    offset_dps: float  # of the gyroscope, by gravity
+    columns: Mapping[str, Any]  # ingest.csv.columns
+
+    @classmethod
+    def of(cls, settings: Settings) -> ChannelLimits:
+        """Return the limits by sensor model, table and ingest profile; those that are not stated are 0."""
+        effects = [settings.sensor.of(s).effects for s in SENSORS]
+        gyroscope = settings.sensor.gyroscope
+
+        def most(name: str) -> float:
+            return max(e.get(name, 0.0) for e in effects)
+
+        stated = EXPANDED * settings.table.rate_accuracy
+        angle = EXPANDED * settings.table.angle_accuracy_deg
+        encoder = most("table_encoder_error")
+        return cls(
+            late_s=most("time_offset") + most("low_pass_lag"),
+            clock=1e-6 * most("clock_rate"),
+            rate=max(SAMPLED, most("table_rate_ripple") + np.radians(encoder) + 1e-6 * most("clock_rate") + stated),
+            rate_stated=stated,
+            angle_deg=encoder + 2.0 * most("table_backlash") + angle,
+            angle_stated_deg=angle,
+            gain=gyroscope.scale_factor + gyroscope.cross_axis,
+            offset_dps=most("g_sensitivity") + most("g_squared_sensitivity"),
+            columns=settings.ingest.csv.get("columns") or {},
+        )
+
+    def column(self, recording: Recording, channel: str) -> str:
+        """Return the name of a channel in the recording's file."""
+        if not str(recording.source.get("file", "")).endswith(".csv"):
+            return channel
+        ends = {"gyroscope": ("gyro_x", "gyro_z"), "table_attitude": ("table_qw", "table_qz")}.get(channel, (channel,))
+        entries = [(c, self.columns.get(c)) for c in ends]
+        return " .. ".join(str(e.get("column", c) or c) if isinstance(e, dict) else c for c, e in entries)
+
+
+@dataclass(frozen=True)
+class Channel:
+    """The rotation by a channel of the table (``table_rate``, ``table_angle``, ``table_attitude``) or a sensor.
+
+    Attributes
+    ----------
+    low, high : (m,) array, deg/s
+        The rate at the samples (m = n) or over the intervals between them (m = n - 1); infinite where it is unknown.
+    turned : (n - 1,) array, deg
+        Angle turned in each interval; 0 where it is unknown.
+    noise : float, deg/s
+    """
+
+    name: str
+    low: Values
+    high: Values
+    turned: Values
+    noise: float
+
+    @property
+    def of_intervals(self) -> bool:
+        """Whether the rates are means over intervals."""
+        return len(self.low) == len(self.turned)
+
+
+def quantiles(values: Values, *shares: float) -> Values:
+    """Return quantiles without interpolation, in a tenth of the time of ``numpy.quantile``."""
+    places = [round(share * (len(values) - 1)) for share in shares]
+    return np.asarray(np.partition(values, places, axis=0)[places])
+
+
+@once_of_log
+def gaps(recording: Recording) -> Mask:
+    """Return which intervals are longer than 1.5 times the usual one: (n - 1,) array."""
+    longest = GAP_INTERVALS * recording.interval * 1e9
+    return np.asarray(np.diff(recording.time_ns) > longest)
+
+
+@once_of_log
+def of_table(recording: Recording) -> tuple[Channel, ...]:
+    """Return the rotation by the table's log: its rate, and the angle of a turn or the attitude of held-out motion.
+
+    In held-out motion the rate is a magnitude.
+    """
+    channels, turns = [], recording.axis is not None
+    rate, angle, attitude = recording.table_rate, recording.table_angle, recording.table_attitude
+    if rate is not None:
+        channels.append(of_rate(recording, "table_rate", rate if turns else np.abs(rate)))
+    if turns and angle is not None:
+        channels.append(_of_turned("table_angle", recording, np.diff(angle)))
+    if not turns and attitude is not None:
+        channels.append(_of_turned("table_attitude", recording, np.linalg.norm(spin(attitude), axis=1)))
+    return tuple(channels)
+
+
+def spin(attitude: Values) -> Values:
+    """Return the rotation vector, in the body, from each attitude to the next: (n - 1, 3) array, deg."""
+    q = continuous(attitude)
+    sine = conjugate_product(q[:-1], q[1:])
+    size = np.linalg.norm(sine, axis=1, keepdims=True)
+    angle = 2.0 * np.arcsin(np.minimum(size, 1.0))
+    return np.asarray(np.degrees(np.where(size > 0, sine * angle / np.where(size > 0, size, 1.0), 0.0)))
+
+
+def _of_turned(name: str, recording: Recording, turned: Values) -> Channel:
+    rate = turned / np.diff(recording.time)
+    lost = gaps(recording)
+    return Channel(name, np.where(lost, -np.inf, rate), np.where(lost, np.inf, rate), np.where(lost, 0.0, turned), 0.0)
+
+
+def of_rate(recording: Recording, name: str, rate: Values, known: Mask | None = None) -> Channel:
+    """Return the rotation by rates at the samples; an unknown rate contradicts nothing."""
+    dt = np.diff(recording.time)
+    turned = np.where(gaps(recording), 0.0, 0.5 * (rate[1:] + rate[:-1]) * dt)
+    low = high = rate
+    if known is not None and not known.all():
+        low, high = np.where(known, rate, -np.inf), np.where(known, rate, np.inf)
+        turned = np.where(known[1:] & known[:-1], turned, 0.0)
+    noise = float(noise_of_steps(np.abs(np.diff(rate)))) if name == "gyroscope" and len(rate) > 1 else 0.0
+    return Channel(name, low, high, turned, noise)
+
+
+def alike(one: Values, two: Values) -> float:
+    """Return the correlation of two angles turned in blocks; 0 if one does not turn."""
+    starts = np.arange(0, len(one), SIGN_BLOCK)
+    a, b = np.add.reduceat(one, starts), np.add.reduceat(two, starts)
+    size = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return float(a @ b) / size if size > 0.0 else 0.0
+
+
+@once
+def gravity_turned(recording: Recording) -> Values | None:
+    """Return the angle by which gravity turned about the turn axis in each interval, deg; None if it does not turn."""
+    force, axis = recording.accelerometer, axis_index(recording)
+    if force is None:
+        return None
+    across = force[:, [(axis + 1) % 3, (axis + 2) % 3]]
+    low, high = quantiles(across, 0.01, 0.99)
+    centred = across - np.where(high - low > 3.0 * LEAST_SWING_G, (low + high) / 2.0, 0.0)
+    if float(median(np.hypot(*centred.T))) < LEAST_SWING_G:
+        return None
+    phase = np.degrees(np.unwrap(np.arctan2(centred[:, 1], centred[:, 0])))
+    turned = np.diff(phase)
+    if float(np.ptp(phase)) < LEAST_TURN_DEG or float(quantiles(np.abs(turned), 0.99)[0]) > FASTEST_DEG:
+        return None
+    turned[gaps(recording)] = 0.0
+    return np.asarray(turned)
+
+
+def of_gravity(recording: Recording, turned: Values, channels: Sequence[Channel]) -> Channel:
+    """Return the rotation by gravity, with the sign of the gyroscope or, without it, of the most similar channel."""
+    correlations = {c.name: alike(turned, c.turned) for c in channels}
+    sure = abs(correlations.get("gyroscope", 0.0)) > OPPOSITE
+    sign = -1.0 if (correlations["gyroscope"] if sure else max(correlations.values(), key=abs)) < 0.0 else 1.0
+    noise = float(noise_of_steps(np.abs(np.diff(turned)))) / recording.interval
+    return replace(_of_turned("gravity", recording, sign * turned), noise=noise)
+
+
+def ratio_quartiles(one: Values, other: Values, cut: int, least: float) -> Values:
+    """Return the weighted quartiles of the ratios of (n,) or (n, k) values to a channel: (3,) or (3, k) array.
+
+    The weights ``|other|`` are cut off at their (1 / cut) largest value; ratios below ``least`` of that are left out.
+    """
+    size = np.abs(other)
+    largest = largest_but(size, cut)
+    used = size > least * largest
+    weight, ratio = np.minimum(size[used], largest), (one[used].T / other[used]).T
+    order = np.argsort(ratio, axis=0)
+    total = np.cumsum(weight[order], axis=0) / weight.sum()
+    places = np.stack([np.count_nonzero(total < share, axis=0) for share in (0.25, 0.5, 0.75)])
+    return np.take_along_axis(ratio, np.take_along_axis(order, places, axis=0), axis=0)
+
+
+def largest_but(size: Values, cut: int) -> float:
+    """Return the value that a share ``1 / cut`` of all values reaches."""
+    place = max(len(size) // cut, 1)
+    return float(np.partition(size, -place)[-place])
+
+
+def axis_index(recording: Recording) -> int:
+    """Return the index of the axis that a recording turns about."""
+    return AXES.index(str(recording.axis))
+
+
+def place(recording: Recording, first: int, last: int) -> str:
+    """Return numbers and times of samples in words; they are rows of the file if ingest left out none."""
+    what = "row" if recording.samples == recording.source.get("rows") else "sample"
+    t = recording.time
+    if first == last:
+        return f"{what} {first + 1} ({t[first]:.9g} s)"
+    return f"{what}s {first + 1} to {last + 1} ({t[first]:.9g} to {t[last]:.9g} s)"
+
+
+def refusal(recording: Recording, code: str, message: str, hint: str) -> IngestError:
+    """Return the error that refuses a recording."""
+    return IngestError(f"recording {recording.name}: {message}", recording.source.get("file"), code=code, hint=hint)

@@ -1,0 +1,397 @@
+"""Check that table angle, rate, attitude, gravity, gyroscope and time do not contradict each other.
+
+Scales are checked first (``pipeline.checks.reference_scale``), then delays, then single samples and stretches
+(``pipeline.checks.reference_rows``). Gain and bias of the gyroscope for these checks come from the unit's turns,
+where they agree. A difference that no effect of the catalogue explains within its configured limit is refused. One
+within these limits that exceeds noise and the table's stated accuracy gets the note ``N-REFERENCE``.
+
+The delay d between the sensor and the table's log minimises the variance S(d) of the difference of two rates, both
+averaged over steps of at least a twentieth of a second. If equal steps of a table give several such minima, the
+smallest |d| is taken. The recording determines d to the interval in which
+
+    n log(S(d) / S_min) <= 5 sqrt(4 d_max)
+
+where n is the number of steps and d_max the largest delay tried, in steps: a window that is moved by d_max exchanges
+2 d_max differences at each end, whose sum of squares has the standard deviation ``sqrt(4 d_max)`` in units of S_min.
+A turn at one rate determines no delay: its interval covers every delay tried.
+
+The effects ``time_offset`` and ``low_pass_lag`` allow a delay; for the sensor, ``clock_rate`` allows the drift of its
+clock since power-on. All recordings of a unit have one offset and one clock. A recording is refused only if its whole
+interval contradicts this.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.checks.evidence import (
+    LEAST_RATE_DPS,
+    OPPOSITE,
+    ChannelLimits,
+    alike,
+    axis_index,
+    gravity_turned,
+    largest_but,
+    of_gravity,
+    of_rate,
+    of_table,
+    quantiles,
+    ratio_quartiles,
+    refusal,
+    spin,
+)
+from pipeline.checks.reference_rows import ChannelComparison
+from pipeline.checks.reference_scale import (
+    check_intervals,
+    check_scale_of_motion,
+    check_scale_of_turn,
+    doubt_of_angle,
+    doubt_of_scale,
+)
+from pipeline.core.records import Note, median, once
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.checks.evidence import Channel
+    from pipeline.core.records import Mask, Recording, Values
+    from pipeline.core.settings import Settings
+
+
+MIN_REFERENCE_SAMPLES = 32  # samples, two short stretches
+# of the usual gain, which the axis turned about reaches; of an interval, between its end and its mean
+MIN_SHARE_OF_USUAL_GAIN = 0.5
+SAME_GAIN = 0.1  # relative difference between gains of one gyroscope in two turns
+FURTHEST, FURTHEST_S = 25, 10.0  # samples of delay that are tried at least, and s at most
+DELAY_STEP_S = 0.05  # step in which delays are tried; a parabola finds what lies between
+CLOCKS = 4001  # rates of the clock that are tried: 5 us in 1 s where it may be off by 1 %
+RESTING = 0.01  # of the fastest rate of a turn, below which the table rests
+QUARTER = 0.25  # of an interval, within which a delay between samples is known
+BETTER = 0.5  # share of the power of the difference of two signals below which they are alike
+NEARLY = 0.1  # share of the power by which one delay has to be better than a smaller one
+SURE_END_DEVIATIONS = 5.0  # standard deviations of the sum of squares that the ends of the window add
+ALIGN = "align the table's log with the sensor's rows, or give it a separate time column (ingest=table_log)"
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Delay of the sensor against the table's log, s, positive if late, and the interval that the recording allows."""
+
+    best: float
+    low: float
+    high: float
+
+    def nearest(self, value: float) -> float:
+        """Return the delay in the interval nearest to a value, s."""
+        return min(max(value, self.low), self.high)
+
+
+def check_turns(recordings: Sequence[Recording], settings: Settings) -> tuple[list[Recording], dict[str, Delay]]:
+    """Return the recordings of a unit with notes on the reference of their turns, and the delay of the sensor in each.
+
+    Signs and directions are not compared: this check precedes that of the mounting, which wrong units would mislead.
+    ``IngestError``: channels of a turn contradict each other by more than an effect of the catalogue explains.
+    """
+    limits, turns = ChannelLimits.of(settings), _turns(recordings)
+    for recording in turns:
+        check_scale_of_turn(recording, limits)
+    check_intervals([r for r in recordings if r.samples >= MIN_REFERENCE_SAMPLES], limits)
+    gyroscope = _Gyroscope(turns)
+    found = {r.name: _check_turn(r, gyroscope, limits) for r in turns}
+    return _with_notes(recordings, found), {name: delay for name, (_, delay) in found.items() if delay is not None}
+
+
+def _turns(recordings: Sequence[Recording]) -> list[Recording]:
+    logged = [r for r in recordings if r.samples >= MIN_REFERENCE_SAMPLES and r.role != "static"]
+    return [r for r in logged if r.axis is not None and not (r.table_rate is None and r.table_angle is None)]
+
+
+def check_motion(recordings: Sequence[Recording], delays: Mapping[str, Delay], settings: Settings) -> list[Recording]:
+    """Return the recordings of a unit with notes on the reference of held-out motion.
+
+    ``recordings``: with their turns by the convention; ``delays``: of the sensor in them. ``IngestError``: channels of
+    held-out motion contradict each other, or the delay of a recording contradicts those of the others.
+    """
+    limits, gyroscope = ChannelLimits.of(settings), _Gyroscope(_turns(recordings))
+    logged = [r for r in recordings if r.samples >= MIN_REFERENCE_SAMPLES and r.role != "static"]
+    moved = [r for r in logged if r.axis is None and not (r.table_rate is None and r.table_attitude is None)]
+    for turn in (r for r in logged if r.axis is not None and r.table_angle is None and r.table_rate is None):
+        _check_attitude_of_turn(turn, limits)
+    found = {r.name: _check_motion(r, gyroscope, limits) for r in moved}
+    late = {**delays, **{name: delay for name, (_, delay) in found.items() if delay is not None}}
+    _check_delays([(r, late[r.name]) for r in recordings if r.name in late], limits)
+    return _with_notes(recordings, found)
+
+
+def _with_notes(
+    recordings: Sequence[Recording], found: Mapping[str, tuple[list[Note], Delay | None]]
+) -> list[Recording]:
+    notes = {name: notes for name, (notes, _) in found.items() if notes}
+    return [replace(r, notes=(*r.notes, *notes[r.name])) if r.name in notes else r for r in recordings]
+
+
+class _Gyroscope:
+    """Rough gain matrix and bias of a gyroscope, by the turns of a unit."""
+
+    def __init__(self, turns: Sequence[Recording]) -> None:
+        self.slopes: dict[str, Values] = {}  # of each turn: (2, 3), gain and bias of each axis; zeros if unknown
+        found: list[tuple[int, float, Values, Values]] = []  # axis turned about, usual fastest rate, gain and bias
+        for recording in turns:
+            rate = recording.logged_rate
+            if rate is None or recording.gyroscope is None:
+                continue
+            gain, bias = self.slopes[recording.name] = _slopes(recording)
+            if np.all(gain):
+                turned = int(np.argmax(np.abs(gain)))  # not the stated axis: the mounting is checked later
+                found.append((turned, float(quantiles(np.abs(rate), 0.9)[0]), gain, bias))
+        gains = [abs(gain[axis]) for axis, _, gain, _ in found]
+        self.usual = float(np.median(gains)) if len(gains) > 2 else 1.0
+        self.matrix = self.usual * np.eye(3)
+        for axis in range(3):
+            fitting = [f for f in found if f[0] == axis and abs(abs(f[2][axis]) / self.usual - 1.0) <= SAME_GAIN]
+            if fitting:
+                self.matrix[:, axis] = max(fitting, key=lambda f: f[1])[2]
+        self.bias = np.median([bias for *_, bias in found], axis=0) if found else None
+
+    def along(self, recording: Recording, axis: int) -> Values | None:
+        """Return the rate about a turn axis with the bias of this recording: (n,) array, deg/s."""
+        rate, slopes = recording.logged_rate, self.slopes.get(recording.name)
+        if recording.gyroscope is None or rate is None or slopes is None:
+            return None
+        reading, gains = recording.gyroscope[:, axis], np.abs(slopes[0]) / self.usual
+        if abs(gains[axis] - 1.0) <= SAME_GAIN:
+            return np.asarray((reading - slopes[1, axis]) / slopes[0, axis])
+        if max(gains) > MIN_SHARE_OF_USUAL_GAIN > gains[axis]:
+            return None  # another axis turns: the check of the mounting decides
+        gain = self.matrix[axis, axis]
+        bias = np.median(reading - gain * rate) if self.bias is None else self.bias[axis]
+        return np.asarray((reading - float(bias)) / gain)
+
+    def vector(self, recording: Recording) -> Values | None:
+        """Return the angular rate: (n, 3) array, deg/s; None if no turn determines the bias."""
+        if recording.gyroscope is None or self.bias is None:
+            return None
+        return np.asarray(np.linalg.solve(self.matrix, (recording.gyroscope - self.bias).T).T)
+
+
+@once
+def _slopes(recording: Recording) -> Values:
+    """Return gain and bias of each axis of a gyroscope by the table's rate: (2, 3) array; zeros if it is constant."""
+    reading, rate = recording.gyroscope, recording.logged_rate
+    assert reading is not None  # noqa: S101
+    assert rate is not None  # noqa: S101
+    change = rate - median(rate)
+    if largest_but(np.abs(change), 100) < LEAST_RATE_DPS:
+        return np.zeros((2, 3))
+    gain = ratio_quartiles(reading - median(reading), change, 100, 0.1)[1]
+    return np.stack([gain, median(reading - gain * rate[:, None])])
+
+
+def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: ChannelLimits) -> tuple[list[Note], Delay | None]:
+    channels, axis = [*of_table(recording)], axis_index(recording)
+    if any(alike(c.turned, channels[0].turned) < -OPPOSITE for c in channels):
+        rate, angle = (limits.column(recording, name) for name in ("table_rate", "table_angle"))
+        problem = f"{rate} and the change of {angle} have opposite signs"
+        hint = f"negate the column of one, or leave {rate} out (ingest.csv.columns.table_rate=null)"
+        raise refusal(recording, "reference_contradiction", problem, hint)
+    measured = gyroscope.along(recording, axis)
+    if measured is not None:
+        channels.append(of_rate(recording, "gyroscope", measured, recording.valid))
+    phase = gravity_turned(recording)
+    if phase is not None and recording.table_angle is not None:
+        channels.append(of_gravity(recording, phase, channels))
+    notes, delay = _compare(recording, channels, limits)
+    ends = float(recording.time[0]), float(recording.time[-1])
+    for doubt in filter(None, (doubt_of_scale(recording, limits), doubt_of_angle(recording, limits))):
+        notes.append(Note("N-REFERENCE", recording.samples, 0, 0, doubt, *ends))
+    return notes, delay
+
+
+def _check_motion(
+    recording: Recording, gyroscope: _Gyroscope, limits: ChannelLimits
+) -> tuple[list[Note], Delay | None]:
+    vector = gyroscope.vector(recording)
+    size = None if vector is None else np.linalg.norm(vector, axis=1)
+    check_scale_of_motion(recording, size, limits)
+    channels = [*of_table(recording)]
+    if size is not None:
+        channels.append(of_rate(recording, "gyroscope", size, recording.valid))
+    found = _compare(recording, channels, limits)
+    if vector is not None and recording.table_attitude is not None:
+        _check_directions(recording, recording.table_attitude, vector, limits)
+    return found
+
+
+def _compare(
+    recording: Recording, channels: Sequence[Channel], limits: ChannelLimits
+) -> tuple[list[Note], Delay | None]:
+    """Compare each channel of the table's log with all others; return notes, and the delay of the sensor."""
+    if len([c for c in channels if c.name != "gravity"]) < 2:
+        return [], None
+    delay = _delay_of(recording, channels, limits)
+    late = abs(delay.nearest(0.0)) if delay else 0.0
+    if late > limits.late_s:  # a clock that drifts: it adds nearly the same delay throughout the recording
+        limits = replace(limits, late_s=late + limits.late_s)
+    notes = []
+    for gross, note in filter(None, map(ChannelComparison(recording, channels, limits).find, channels)):
+        if gross:
+            hint = "correct or leave out these rows of the table's log, or record again"
+            raise refusal(recording, "reference_contradiction", note.detail, hint)
+        notes.append(note)
+    return notes, delay
+
+
+def _check_attitude_of_turn(recording: Recording, limits: ChannelLimits) -> None:
+    """Compare the attitude of a turn without angle and rate with the gyroscope, whose bias is its median at rest."""
+    if recording.table_attitude is None or recording.gyroscope is None:
+        return
+    speed = np.linalg.norm(spin(recording.table_attitude), axis=1) / np.diff(recording.time)
+    fastest = float(quantiles(speed, 0.99)[0])
+    moving, resting = speed > MIN_SHARE_OF_USUAL_GAIN * fastest, speed < RESTING * fastest
+    if min(np.count_nonzero(moving), np.count_nonzero(resting)) >= MIN_REFERENCE_SAMPLES:
+        vector = recording.gyroscope - median(recording.gyroscope[1:][resting])
+        _check_directions(recording, recording.table_attitude, vector, limits, moving)
+
+
+def _check_directions(
+    recording: Recording, attitude: Values, vector: Values, limits: ChannelLimits, where: Mask | slice = slice(None)
+) -> None:
+    """Refuse an attitude whose rotation has another direction in the body than the gyroscope's."""
+    logged = (spin(attitude) / np.diff(recording.time)[:, None])[where]
+    measured = 0.5 * (vector[1:] + vector[:-1])[where]
+    off, size = np.linalg.norm(logged - measured, axis=1), np.linalg.norm(measured, axis=1)
+    change = np.linalg.norm(np.diff(vector, axis=0), axis=1)[where] / recording.interval
+    allowed = (limits.gain + limits.rate) * size + limits.late_s * change + limits.offset_dps
+    usual_off, usual_size = float(np.median(off)), float(np.median(size))
+    if usual_off > float(np.median(allowed)) + 0.5 * usual_size:
+        raise refusal(
+            recording,
+            "reference_contradiction",
+            f"{limits.column(recording, 'table_attitude')} turns about other body axes than the gyroscope reads: their "
+            f"angular rates differ by {usual_off:.3g} deg/s at the median, at {usual_size:.3g} deg/s",
+            "is it the attitude of this recording, from body to level, in the order w, x, y, z?",
+        )
+
+
+def _delay_of(recording: Recording, channels: Sequence[Channel], limits: ChannelLimits) -> Delay | None:
+    """Return the delay of the sensor against the table's log; refuse a delay that no effect explains."""
+    first, *others = (c for c in channels if c.name != "gravity")
+    found = None
+    for other in others:
+        of_sensor = other.name == "gyroscope"
+        allowed = limits.late_s + (limits.clock * float(recording.time[-1]) if of_sensor else 0.0)
+        step, one, two = _thinned(first, other, recording)
+        furthest = min(max(int(np.ceil(min(allowed, FURTHEST_S) / step)), FURTHEST), len(one) // 4)
+        squares, steps = _variances(one[furthest : len(one) - furthest], two), len(one) - 2 * furthest
+        power = min(float(np.var(one)), float(np.var(two)))
+        if float(squares.min()) >= BETTER * power:
+            continue  # nothing moves, or they are not alike at any delay
+        interval = _interval(squares, NEARLY * power, steps)
+        if interval is None:
+            continue
+        best, low, high = ((d - furthest) * step for d in interval)
+        delay = Delay(best, low, high)
+        if abs(delay.nearest(0.0)) > max(allowed, MIN_SHARE_OF_USUAL_GAIN * step) + QUARTER * step:
+            raise refusal(
+                recording,
+                "reference_contradiction",
+                f"{limits.column(recording, first.name)} runs {abs(best):.3g} s {'late' if best < 0 else 'early'} "
+                f"against {limits.column(recording, other.name)}; the limits of time_offset, low_pass_lag"
+                f"{' and clock_rate' if of_sensor else ''} allow {allowed:.3g} s",
+                ALIGN,
+            )
+        found = delay if of_sensor else found
+    return found
+
+
+def _variances(fixed: Values, moved: Values) -> Values:
+    """Return the variance of the difference between (n,) values and each n successive ones of (m,): (m - n + 1,)."""
+    n, one, two = len(fixed), fixed - fixed.mean(), moved - moved.mean()
+    total, squares = (np.append(0.0, np.cumsum(v)) for v in (two, two * two))
+    power = one @ one
+    difference = power + squares[n:] - squares[:-n] - 2.0 * np.correlate(two, one, "valid")
+    rounding = np.finfo(float).eps * power
+    return np.asarray(np.maximum(difference - (total[n:] - total[:-n]) ** 2 / n, rounding) / n)
+
+
+def _check_delays(found: Sequence[tuple[Recording, Delay]], limits: ChannelLimits) -> None:
+    """Refuse a recording whose delay contradicts the one offset and the one clock of a unit's recordings.
+
+    For some tau and e with ``|tau| <= time_offset + low_pass_lag`` and ``|e| <= clock_rate``, ``tau + e t`` has to be
+    in the interval of every recording at some time t of it. If not, the recording whose removal allows it is refused.
+    """
+    if len(found) < 2 or not all(r.clock_shared for r, _ in found):
+        return
+    known = QUARTER * np.array([max(r.interval, DELAY_STEP_S) for r, _ in found])
+    intervals = np.array([[r.time[0], r.time[-1], d.low, d.high] for r, d in found])
+    intervals[:, 2:] += np.outer(known, [-1.0, 1.0])
+    if _of_one_clock(intervals, limits):
+        return
+    alone = [i for i in range(len(found)) if _of_one_clock(np.delete(intervals, i, axis=0), limits)]
+    recording, late = found[alone[0] if alone else int(np.argmax([abs(d.nearest(0.0)) for _, d in found]))]
+    others = [d.best for r, d in found if r is not recording]
+    raise refusal(
+        recording,
+        "reference_contradiction",
+        f"the sensor is {late.best:.3g} s late against the table's log ({late.low:.3g} to {late.high:.3g} s), and "
+        f"{min(others):.3g} to {max(others):.3g} s in the other recordings of the unit; one offset of at most "
+        f"{limits.late_s:.3g} s (time_offset, low_pass_lag) and one clock_rate of at most {limits.clock:.3g} do not "
+        "explain both",
+        ALIGN,
+    )
+
+
+def _of_one_clock(intervals: Values, limits: ChannelLimits) -> bool:
+    """Return whether one offset and one clock explain (r, 4) first and last times, least and largest delays, s."""
+    start, end, low, high = intervals.T
+    if max(low.max(), -limits.late_s) <= min(high.min(), limits.late_s):  # without any drift
+        return True
+    drift = np.linspace(-limits.clock, limits.clock, CLOCKS)[:, None, None] * np.stack([start, end])
+    least = np.maximum((low - drift.max(axis=1)).max(axis=1), -limits.late_s)
+    most = np.minimum((high - drift.min(axis=1)).min(axis=1), limits.late_s)
+    return bool(np.any(least <= most))
+
+
+def _thinned(first: Channel, other: Channel, recording: Recording) -> tuple[float, Values, Values]:
+    """Return the step, s, and the mean rates of two channels over steps of about a twentieth of a second at least."""
+    one, two = (c.low if c.of_intervals else 0.5 * (c.low[1:] + c.low[:-1]) for c in (first, other))
+    known = np.isfinite(one) & np.isfinite(two)
+    one, two = np.where(known, one, 0.0), np.where(known, two, 0.0)
+    size = max(1, int(DELAY_STEP_S / recording.interval))
+    if size > 1:
+        count = len(one) // size
+        one, two = (v[: count * size].reshape(count, size).mean(axis=1) for v in (one, two))
+    return size * recording.interval, one, two
+
+
+def _interval(squares: Values, room: float, steps: int) -> tuple[float, float, float] | None:
+    """Return the index of the minimum, and of the first and the last delay that the steps do not exclude.
+
+    None if they exclude neither the first nor the last of all delays tried.
+    """
+    best = _nearest_minimum(squares, room)
+    least = max(float(squares.min()), float(np.finfo(float).tiny))
+    over = np.log(np.maximum(squares, least)) - np.log(least)  # their quotient may exceed the largest number
+    open_to = np.flatnonzero(steps * over <= SURE_END_DEVIATIONS * np.sqrt(2.0 * len(squares)))
+    if open_to[0] == 0 and open_to[-1] == len(squares) - 1:
+        return None
+    return best, min(best, float(open_to[0])), max(best, float(open_to[-1]))
+
+
+def _nearest_minimum(squares: Values, room: float) -> float:
+    """Return the index, nearest to the middle, of a minimum at most ``room`` above the least: equal steps repeat.
+
+    A minimum between samples is that of the parabola through the least sample and its neighbours.
+    """
+    a, b, c = squares[:-2], squares[1:-1], squares[2:]
+    lowest = (b <= a) & (b <= c) & (a + c > 2.0 * b)
+    shift = 0.5 * (a - c) / np.where(lowest, a - 2.0 * b + c, np.inf)
+    value = np.where(lowest, np.maximum(b - 0.25 * (a - c) * shift, 0.0), np.inf)
+    if not np.isfinite(value).any():
+        return float(np.argmin(squares))
+    minima = np.flatnonzero(value <= value.min() + room)
+    nearest = int(minima[np.argmin(np.abs(minima + 1 - len(squares) // 2))])
+    return nearest + 1 + float(shift[nearest])

@@ -1,0 +1,1 @@
+"""What all rooms share: records of readings and results, settings, errors, files."""

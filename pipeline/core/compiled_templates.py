@@ -1,0 +1,43 @@
+"""Templates that were compiled before, in the user's cache folder."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jinja2
+
+from pipeline.core.files import state_of_files
+from pipeline.core.user_cache import from_cache, to_cache
+
+if TYPE_CHECKING:
+    from jinja2.bccache import Bucket
+
+
+class CompiledTemplates(jinja2.BytecodeCache):
+    """The compiled templates of a package, for ``jinja2.Environment(bytecode_cache=...)``."""
+
+    def __init__(self, package: str) -> None:
+        self.package = package
+
+    def get_cache_key(self, name: str, filename: str | None = None) -> str:  # noqa: ARG002  (as jinja2 calls it)
+        """Return the name of a template in the cache."""
+        return f"{self.package}-{name}"
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        """Load the code of a template."""
+        bucket.code = from_cache(bucket.key, _state(bucket))
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        """Store the code of a template."""
+        to_cache(bucket.key, _state(bucket), bucket.code)
+
+
+def _state(bucket: Bucket) -> str:
+    return f"{_jinja()} {bucket.checksum}"  # of its source
+
+
+@cache
+def _jinja() -> str:
+    return state_of_files(Path(jinja2.__file__).parent.glob("*.py"))

@@ -1,0 +1,181 @@
+"""Atomic writing of files, JSON documents, and the paths of the shipped files.
+
+A file is written under a temporary name and then renamed, so it is complete or absent even after a crash. ``fsync``
+makes it survive a power failure. It takes some milliseconds, so a job that writes many files flushes them together.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import json
+import math
+import os
+import re
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from pipeline.core.errors import DamagedFileError
+
+JSON: TypeAlias = dict[str, Any]  # a document, or a part of one
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+_PACKAGE = Path(__file__).resolve().parent
+INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
+SHIPPED = _PACKAGE / "shipped" if INSTALLED else _PACKAGE.parent  # holds Snakefile, workflow, configs, data
+CONFIGS = SHIPPED / "configs"
+# First characters by which spreadsheets take a text as a formula, or split it (OWASP, CSV injection). With ' in front,
+# the text was escaped, or begins so.
+FORMULA = re.compile(r"'*[=+\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
+NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
+WRITE_AGAIN = "run the same command again: snakemake writes the file anew"
+_encoder = json.JSONEncoder(ensure_ascii=False, allow_nan=False, default=lambda array: array.tolist())  # numpy arrays
+_flushed_at_end: list[Path] = []  # folders whose files are flushed together
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file under a temporary name in its folder, flush it to the disk, then rename it.
+
+    Parameters
+    ----------
+    path : Path
+        Its folder is created if it does not exist.
+    content : str or bytes
+        Text is written as UTF-8; line ends are not changed.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        stream = temporary.open("wb")
+    except FileNotFoundError:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stream = temporary.open("wb")
+    with stream:
+        stream.write(content.encode() if isinstance(content, str) else content)
+        if not _flushed_at_end:
+            stream.flush()
+            os.fsync(stream.fileno())
+    temporary.replace(path)
+
+
+def state_of_files(files: Iterable[Path]) -> str:
+    """Return a digest of the names, sizes and times of files."""
+    digest = hashlib.sha256()
+    for file in sorted(files):
+        status = file.stat()
+        digest.update(f"{file}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
+    return digest.hexdigest()[:16]
+
+
+def read_json(path: Path, read: Callable[[Path], bytes] = Path.read_bytes) -> Any:  # noqa: ANN401  (any JSON value)
+    """Read a JSON file that an earlier stage of a run wrote; ``read`` returns its content.
+
+    Raises ``DamagedFileError`` if it does not exist or is not JSON.
+    """
+    try:
+        return json.loads(read(path))
+    except (OSError, ValueError) as error:
+        reason = f"cannot be read, it is missing or damaged ({error}); {WRITE_AGAIN}"
+        raise DamagedFileError(reason, str(path)) from None
+
+
+def _encoded(value: Any) -> str:  # noqa: ANN401
+    try:
+        return _encoder.encode(value)
+    except ValueError as error:
+        raise ValueError(f"{error}: {', '.join(_not_finite(value))}") from None
+
+
+def _not_finite(value: Any, place: str = "value") -> Iterator[str]:  # noqa: ANN401
+    """Yield the place of each number that is not finite, with the texts in the same objects, which identify it."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield f"{place} is {value}"
+    elif isinstance(value, dict):
+        names = " ".join(v for v in value.values() if isinstance(v, str))
+        for key, member in value.items():
+            yield from _not_finite(member, f"{place}.{key}{f' ({names})' * bool(names)}")
+    elif hasattr(value, "__len__") and not isinstance(value, str):
+        for number, member in enumerate(value):
+            yield from _not_finite(member, f"{place}[{number}]")
+
+
+def json_text(value: Any, levels: int = 3, indent: str = "\n") -> str:  # noqa: ANN401
+    """Return a value as JSON; ``ValueError`` names the place of a number that is not finite.
+
+    Down to ``levels``, containers of containers are indented. Each other container is on one line, which C code writes.
+    """
+    if levels and isinstance(value, dict | list) and value:
+        members = list(value.values() if isinstance(value, dict) else value)
+        if any(isinstance(member, dict | list | tuple) for member in members):
+            names = [f"{_encoded(str(name))}: " for name in value] if isinstance(value, dict) else [""] * len(members)
+            inner = indent + " "
+            lines = [name + json_text(m, levels - 1, inner) for name, m in zip(names, members, strict=True)]
+            opening, closing = "{}" if isinstance(value, dict) else "[]"
+            return f"{opening}{inner}{f',{inner}'.join(lines)}{indent}{closing}"
+    return _encoded(value)
+
+
+def write_json(path: Path, value: Any) -> None:  # noqa: ANN401
+    """Write a value as a JSON file, atomically."""
+    write_atomically(path, json_text(value) + "\n")
+
+
+def spreadsheet_cell(text: str) -> str:
+    """Return a text for a CSV file that people open in a spreadsheet: one that would be a formula gets a ' in front.
+
+    Numbers remain numbers. ``text_of_cell`` is the inverse.
+    """
+    return f"'{text}" if FORMULA.match(text) and not NUMBER.fullmatch(text) else text
+
+
+def text_of_cell(cell: str) -> str:
+    """Return the text of a cell of ``spreadsheet_cell``."""
+    return cell[1:] if cell.startswith("'") and FORMULA.match(cell) else cell
+
+
+def exchange(one: Path, other: Path) -> None:
+    """Exchange two files or folders of one file system atomically, so that both names always exist.
+
+    Only Linux has the system call (``renameat2``). On other systems three renames exchange them.
+    """
+    at_cwd, rename_exchange = -100, 2  # AT_FDCWD of fcntl.h, RENAME_EXCHANGE of linux/fs.h
+    system = ctypes.CDLL(None, use_errno=True)
+    names = os.fsencode(one), os.fsencode(other)
+    if not hasattr(system, "renameat2") or system.renameat2(at_cwd, names[0], at_cwd, names[1], rename_exchange) != 0:
+        between = one.with_name(f".{one.name}.{os.getpid()}.tmp")
+        other.rename(between)
+        one.rename(other)
+        between.rename(one)
+
+
+@contextmanager
+def flushed_together(folder: Path) -> Iterator[None]:
+    """Flush all files that the block writes to the file system of a folder once, at the end of the block."""
+    _flushed_at_end.append(folder)
+    try:
+        yield
+    finally:
+        _flushed_at_end.pop()
+    flush_file_system(folder)
+
+
+def flush_file_system(folder: Path) -> None:
+    """Flush the buffers of the file system that contains a folder; raises ``OSError`` on failure."""
+    system = ctypes.CDLL(None, use_errno=True)
+    if not hasattr(system, "syncfs"):  # not Linux
+        os.sync()
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        if system.syncfs(descriptor) != 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), str(folder))
+    finally:
+        os.close(descriptor)
+
+
+def canonical_json(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)
+    """Return JSON with sorted keys and no blanks, for digests."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()

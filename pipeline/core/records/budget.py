@@ -1,0 +1,236 @@
+"""The uncertainty budget of a sensor's calibration: its lines, the sources it does not include, a Monte Carlo run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from pipeline.core.records.parameters import standard_uncertainty
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from imu_logs.log import Mask, Values
+    from pipeline.core.records.parameters import Parameters
+
+NORMAL, RECTANGULAR = "normal", "rectangular"
+LIMIT = "not determined by the recordings: limit of the sensor file"  # a source of the uncertainty budget
+MONTE_CARLO = "monte_carlo"  # key of the run in a published budget
+
+
+@dataclass(frozen=True)
+class BudgetLine:
+    """One line of an uncertainty budget: the share of one source (JCGM 100:2008, 8 and annex H)."""
+
+    source: str
+    kind: str  # A (from the scatter of these recordings) or B (from other knowledge)
+    distribution: str  # assumed for the input
+    standard_uncertainty: Values  # (p,), of the parameters, from this source only
+    degrees_of_freedom: Values  # (p,)
+    input_uncertainty: float | None = None  # standard uncertainty; None if the source is not a single quantity
+    input_unit: str = ""
+    independent: int = 1  # number of independent quantities with this uncertainty (stops of a table, axes)
+    parts: Mapping[str, Values] = field(default_factory=dict)  # known components, (p,) standard uncertainties
+    remark: str = ""
+
+    def at(self, rows: Sequence[int | None]) -> BudgetLine:
+        """Return the line of some parameters, by their places; None: a parameter without an uncertainty."""
+        return replace(
+            self,
+            standard_uncertainty=_at(self.standard_uncertainty, rows),
+            degrees_of_freedom=_at(self.degrees_of_freedom, rows, np.inf),
+            parts={name: _at(values, rows) for name, values in self.parts.items()},
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the published line; the sensitivity is contribution / input uncertainty."""
+        contribution, u = self.standard_uncertainty, self.input_uncertainty
+        return {
+            "source": self.source,
+            "type": self.kind,
+            "distribution": self.distribution,
+            "standard_uncertainty": u,
+            "unit": self.input_unit,
+            "independent_inputs": self.independent,
+            "sensitivity": (contribution / u).tolist() if u else None,
+            "contribution": contribution.tolist(),
+            "degrees_of_freedom": finite(self.degrees_of_freedom),
+            "parts": {name: values.tolist() for name, values in self.parts.items()},
+            "remark": self.remark,
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Return the object from the value of ``to_json``."""
+        return cls(
+            data["source"],
+            data["type"],
+            data["distribution"],
+            np.array(data["contribution"], float),
+            unlimited(data["degrees_of_freedom"]),
+            data["standard_uncertainty"],
+            data["unit"],
+            data["independent_inputs"],
+            {name: np.array(values, float) for name, values in data["parts"].items()},
+            data["remark"],
+        )
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """The share of one source with its covariance; the fields are those of ``BudgetLine``."""
+
+    source: str
+    kind: str
+    distribution: str
+    covariance: Values  # (p, p), of the parameters, from this source only
+    degrees_of_freedom: Values  # (p,)
+    input_uncertainty: float | None = None
+    input_unit: str = ""
+    independent: int = 1
+    parts: Mapping[str, Values] = field(default_factory=dict)
+    remark: str = ""
+
+    @property
+    def standard_uncertainty(self) -> Values:
+        """Standard uncertainty of each parameter from this source: (p,) array."""
+        return standard_uncertainty(self.covariance)
+
+    def of(self, selected: slice) -> Contribution:
+        """Return the contribution to the selected parameters."""
+        parts = {name: values[selected] for name, values in self.parts.items()}
+        freedom = self.degrees_of_freedom[selected]
+        return replace(self, covariance=self.covariance[selected, selected], degrees_of_freedom=freedom, parts=parts)
+
+    def line(self) -> BudgetLine:
+        """Return the line of the budget."""
+        others = {key: value for key, value in vars(self).items() if key != "covariance"}
+        return BudgetLine(standard_uncertainty=self.standard_uncertainty, **others)
+
+
+@dataclass(frozen=True)
+class NotIncluded:
+    """A source that a budget does not include."""
+
+    source: str
+    reason: str
+    up_to: Mapping[str, float] = field(default_factory=dict)  # largest error, of ``bias`` or of ``matrix`` (relative)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the published entry."""
+        return {"source": self.source, "reason": self.reason} | ({"up_to": dict(self.up_to)} if self.up_to else {})
+
+
+@dataclass(frozen=True)
+class MonteCarlo:
+    """A Monte Carlo run and its comparison with the law of propagation (JCGM 101:2008, 8); arrays: (p,)."""
+
+    trials: int
+    seed: int
+    digits: int
+    estimate: Values
+    expanded_uncertainty: Values  # by the law of propagation
+    mean: Values
+    standard_uncertainty: Values
+    low: Values  # ends of the coverage interval, 95 %
+    high: Values
+    tolerance: Values
+    d_low: Values  # differences of the ends
+    d_high: Values
+    validated: Mask
+
+    def at(self, rows: Sequence[int | None]) -> MonteCarlo:
+        """Return the run of some parameters; None: one without an uncertainty."""
+        arrays: dict[str, Any] = {
+            key: _at(values, rows, key == "validated")
+            for key, values in vars(self).items()
+            if isinstance(values, np.ndarray)
+        }
+        return replace(self, **arrays)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the published entry."""
+        values = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
+        head = {"trials": values.pop("trials"), "reason": None}
+        return head | values | {"all_validated": bool(self.validated.all())}
+
+
+@dataclass(frozen=True)
+class NoMonteCarlo:
+    """The reason why there is no Monte Carlo run although it is configured."""
+
+    reason: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the published entry."""
+        return {"trials": 0, "reason": self.reason}
+
+
+def _run_from_json(data: Mapping[str, Any] | None) -> MonteCarlo | NoMonteCarlo | None:
+    if data is None:
+        return None
+    if not data["trials"]:
+        return NoMonteCarlo(data["reason"])
+    names = (each.name for each in fields(MonteCarlo))
+    values: dict[str, Any] = {
+        name: np.array(data[name]) if isinstance(data[name], list) else data[name] for name in names
+    }
+    return MonteCarlo(**values)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The budget of a calibration; the totals are those of its parameters."""
+
+    lines: tuple[BudgetLine, ...]
+    not_included: tuple[NotIncluded, ...]
+    monte_carlo: MonteCarlo | NoMonteCarlo | None = None
+
+    def at(self, rows: Sequence[int | None]) -> Budget:
+        """Return the budget of some parameters, by their places; None: a parameter without an uncertainty."""
+        run = self.monte_carlo
+        return replace(
+            self,
+            lines=tuple(line.at(rows) for line in self.lines),
+            monte_carlo=run.at(rows) if isinstance(run, MonteCarlo) else run,
+        )
+
+    def to_json(self, parameters: Parameters) -> dict[str, Any]:
+        """Return the published budget; ``parameters``: of the calibration."""
+        document = {
+            "parameters": list(parameters.names),
+            "units": list(parameters.units),
+            "contributions": [line.to_json() for line in self.lines],
+            "standard_uncertainty": parameters.standard_uncertainty.tolist(),
+            "effective_degrees_of_freedom": finite(parameters.degrees_of_freedom),
+            "coverage_factor": parameters.coverage_factor.tolist(),
+            "expanded_uncertainty": parameters.expanded_uncertainty.tolist(),
+            "not_included": [entry.to_json() for entry in self.not_included],
+        }
+        return document if self.monte_carlo is None else document | {MONTE_CARLO: self.monte_carlo.to_json()}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Return the object from the value of ``to_json``."""
+        return cls(
+            tuple(map(BudgetLine.from_json, data.get("contributions", ()))),
+            tuple(NotIncluded(**entry) for entry in data.get("not_included", ())),
+            _run_from_json(data.get(MONTE_CARLO)),
+        )
+
+
+def _at(values: Values, rows: Sequence[int | None], absent: float = 0.0) -> Values:
+    """Return the values at these places, and ``absent`` in place of None."""
+    return np.array([absent if row is None else values[row] for row in rows], values.dtype)
+
+
+def finite(values: Values) -> list[float | None]:
+    """Return a list for JSON, with None in place of values that are not finite."""
+    return [float(v) if np.isfinite(v) else None for v in values]
+
+
+def unlimited(values: list[float | None]) -> Values:
+    """Return the degrees of freedom from the value of ``finite``: infinite in place of None."""
+    return np.array([np.inf if value is None else value for value in values])

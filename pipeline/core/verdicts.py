@@ -1,0 +1,220 @@
+"""The verdicts of a diagnosis on one sensor, and what they and other findings mean for the units of a campaign.
+
+``pipeline.evaluation.diagnosis.verdict`` decides which verdict applies.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+SENSORS = ("accelerometer", "gyroscope")
+
+
+class Verdict(StrEnum):
+    """A verdict, in the order in which lists name them: what can be added first, then what is in doubt."""
+
+    MISSING_EFFECT = "missing_effect"
+    REFERENCE_IN_DOUBT = "reference_in_doubt"  # table, held-out motion or static recording contradict each other
+    UNEXPLAINED = "unexplained"
+    FLOOR_IN_DOUBT = "floor_in_doubt"  # the estimate of the noise
+    LEFT_BY_METHOD = "left_by_method"  # the approximations of the chosen method leave more than noise
+    NOT_ENOUGH_DATA = "not_enough_data"
+    NOTHING_MISSING = "nothing_missing"
+
+    @property
+    def css_class(self) -> str:
+        """Class of the style sheet on the pages."""
+        return {Verdict.NOT_ENOUGH_DATA: "", Verdict.NOTHING_MISSING: "good"}.get(self, "warn")
+
+
+def css_class(verdict: str | None) -> str:
+    """Return the class of a verdict of a document; empty for a sensor without one."""
+    return Verdict(verdict).css_class if verdict in set(Verdict) else ""
+
+
+WITH_THEM = ", with which the largest U is "  # between open effects and the uncertainty, in summary.csv and sentences
+MARK_ABOVE_FLOORS = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good
+FAILED, INCOMPLETE, IMPLAUSIBLE, NOT_HELD_OUT = "failed", "incomplete", "implausible", "not_held_out"
+FAR, BEYOND_ACCEPTANCE, READY = "far_above_noise", "beyond_acceptance", "ready"
+SETTING = re.compile(r"\(([a-z_.]+=\w+)\)")  # a setting within a next step
+
+
+class Kind(NamedTuple):
+    """A kind of problem: name in lists, meaning, next step where a diagnosis names none, class of style."""
+
+    name: str
+    meaning: str
+    step: str
+    css_class: str = "warn"
+
+
+KINDS = {  # the most urgent first
+    FAILED: Kind("failed", "no calibration", "correct the cause, then run the same command again", "bad"),
+    INCOMPLETE: Kind(
+        "not complete", "a stage after the fit failed; the calibration does not depend on it",
+        "read the cause on the unit's page", "bad",
+    ),
+    Verdict.MISSING_EFFECT: Kind("effect missing", "the model lacks an effect that the recordings show", "add it"),
+    IMPLAUSIBLE: Kind(
+        "implausible", "a parameter is beyond four times the sensor file's limit",
+        "check range, unit and columns, which the unit's page names",
+    ),
+    Verdict.REFERENCE_IN_DOUBT: Kind(
+        "reference in doubt", "recordings contradict each other", "check table log and mounting, and record again"
+    ),
+    Verdict.UNEXPLAINED: Kind(
+        "unexplained", "the error exceeds the noise, and no effect of the catalogue explains it",
+        "record what the unit's page proposes",
+    ),
+    Verdict.FLOOR_IN_DOUBT: Kind(
+        "noise in doubt", "the noise estimate may be too large, and hide an effect", "record static again"
+    ),
+    Verdict.LEFT_BY_METHOD: Kind(
+        "method leaves an error", "approximations of method or filter leave an error above the noise",
+        "calibrate with a method that fits the full matrix (method=reference_least_squares)",
+    ),
+    FAR: Kind(
+        "far above noise", "the uncertainty of the calibration explains the error, but does not show that it is good",
+        "record more",
+    ),
+    Verdict.NOT_ENOUGH_DATA: Kind(
+        "not enough data", "the recordings cannot show whether an effect is missing", "record more turns or poses"
+    ),
+    NOT_HELD_OUT: Kind(
+        "not held out", "the error is that of the samples of the fit", "record held-out motion (validation)"
+    ),
+    BEYOND_ACCEPTANCE: Kind("fails its limits", "beyond a limit of acceptance", "see the unit's page", "bad"),
+    READY: Kind("ready", "calibrated; nothing that the recordings can show is missing", "apply it", "good"),
+}  # fmt: skip
+
+
+class Error(NamedTuple):
+    """The held-out rms error of a sensor before and after calibration, and what noise alone gives, in its unit.
+
+    ``kind``: "vector" where the attitude is known in every sample, else "magnitude".
+    """
+
+    kind: str
+    before: float | None
+    after: float | None
+    floor: float | None
+
+    @property
+    def ratio(self) -> float | None:
+        """Error after calibration over the noise floor."""
+        return self.after / self.floor if self.after is not None and self.floor else None
+
+
+class Problem(NamedTuple):
+    """What keeps units from being ready: a line of a campaign's page and of the terminal.
+
+    ``kind``: of ``KINDS``; ``what``: sensors, with missing effects; ``units``: the worst first; ``ratios``: smallest
+    and largest error over noise floor; ``step``: what to do next; ``effects``: ``sensor.effect`` that are missing.
+    """
+
+    kind: str
+    what: str
+    units: list[str]
+    ratios: tuple[float, float] | None
+    step: str
+    effects: tuple[str, ...] = ()
+
+
+def error_of(held_out: Mapping[str, Any] | None) -> Error:
+    """Return the error that pages and terminal state; ``held_out``: the sensor's part of a validation."""
+    steps = (held_out or {}).get("steps") or [{}]
+    ends, floor = (steps[0], steps[-1]), (held_out or {}).get("vector_noise_floor")
+    if floor and all(step.get("vector_rms_error") is not None for step in ends):
+        return Error("vector", ends[0]["vector_rms_error"], ends[1]["vector_rms_error"], floor)
+    before, after = (step.get("rms_error") for step in ends)
+    return Error("magnitude", before, after, (held_out or {}).get("noise_floor"))
+
+
+def error_in_row(row: Mapping[str, Any], sensor: str) -> Error:
+    """Return the same from a row of ``summary.csv``."""
+    for kind, prefix in (("vector", f"{sensor}_vector"), ("magnitude", sensor)):
+        floor = _number(row.get(f"{prefix}_noise_floor"))
+        if floor or kind == "magnitude":
+            before, after = _number(row.get(f"{prefix}_error_before")), _number(row.get(f"{prefix}_error_after"))
+            break
+    return Error(kind, before, after, floor)
+
+
+class RowState(NamedTuple):
+    """A row of ``summary.csv`` with its errors by sensor, and what keeps the unit from being ready (``kinds_of``)."""
+
+    row: Mapping[str, Any]
+    errors: dict[str, Error]
+    kinds: dict[str, list[str]]
+
+
+def state_of(row: Mapping[str, Any] | RowState) -> RowState:
+    """Return the state of a row; a state as it is."""
+    if isinstance(row, RowState):
+        return row
+    errors = {sensor: error_in_row(row, sensor) for sensor in SENSORS}
+    return RowState(row, errors, _kinds(row, errors))
+
+
+def _number(value: Any) -> float | None:  # noqa: ANN401  (a cell: a number, a text of it, or nothing)
+    if isinstance(value, str):
+        value = float(value or "nan")
+    return float(value) if value is not None and -math.inf < value < math.inf else None
+
+
+def kinds_of(row: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Return what keeps a unit from being ready, the most urgent kind first, with the sensors concerned."""
+    return state_of(row).kinds
+
+
+def _kinds(row: Mapping[str, Any], errors: Mapping[str, Error]) -> dict[str, list[str]]:
+    if row.get("status") != "ok":
+        return {FAILED: []}
+    causes = (row.get("incomplete") or "").split("; ")
+    found: dict[str, list[str]] = {INCOMPLETE: []} if row.get("incomplete") else {}
+    if str(row.get("pass")).lower() == "false":
+        found[BEYOND_ACCEPTANCE] = []
+    for sensor in SENSORS:
+        verdict, ratio = row.get(f"{sensor}_verdict") or Verdict.NOTHING_MISSING, errors[sensor].ratio
+        if any(cause.startswith(("diagnose: ", f"diagnose/{sensor}: ")) for cause in causes):
+            verdict = Verdict.NOTHING_MISSING  # it is not known, and the kind is INCOMPLETE
+        quiet = verdict in (Verdict.NOTHING_MISSING, Verdict.NOT_ENOUGH_DATA)
+        kinds = [] if verdict == Verdict.NOTHING_MISSING else [str(verdict)]
+        kinds += [FAR] * bool(quiet and ratio and ratio > MARK_ABOVE_FLOORS)
+        kinds += [kind for kind in (IMPLAUSIBLE, NOT_HELD_OUT) if row.get(f"{sensor}_{kind}")]
+        for kind in kinds:
+            found.setdefault(kind, []).append(sensor)
+    return {kind: found[kind] for kind in KINDS if kind in found} if len(found) > 1 else found
+
+
+def problems(rows: Sequence[Mapping[str, Any] | RowState]) -> list[Problem]:
+    """Group the units of a campaign by what keeps them from being ready, the most urgent first."""
+    groups: dict[tuple[str, tuple[str, ...]], list[tuple[float, str, str, list[str]]]] = {}
+    for row, errors, kinds in map(state_of, rows):
+        for kind, sensors in kinds.items():
+            effects: tuple[str, ...] = ()
+            if kind == Verdict.MISSING_EFFECT:
+                names = [(s, (row.get(f"{s}_selected") or "").split(";")) for s in sensors]
+                effects = tuple(f"{s}.{name}" for s, chosen in names for name in chosen if name)
+            ratio, worst = max(((errors[s].ratio or 0.0, s) for s in sensors), default=(0.0, ""))
+            step = row.get(f"{worst}_next_step") or ""
+            groups.setdefault((kind, effects), []).append((ratio, str(row["unit"]), step, sensors))
+    order, found = [*KINDS], []
+    for (kind, effects), entries in sorted(groups.items(), key=lambda group: order.index(group[0][0])):
+        entries.sort(key=lambda entry: -entry[0])
+        known = [ratio for ratio, *_ in entries if ratio]
+        of = [s for s in SENSORS if any(s in sensors for *_, sensors in entries)]
+        what = ", ".join(effects).replace("_", " ").replace(".", ": ") if effects else ", ".join(of)
+        step = KINDS[kind].step
+        if kind in set(Verdict) - {Verdict.MISSING_EFFECT} and entries[0][2]:
+            others = len({entry[2] for entry in entries}) > 1
+            step = entries[0][2] + f" ({entries[0][1]}; the pages of the others state theirs)" * others
+        units, span = [unit for _, unit, *_ in entries], (known[-1], known[0]) if known else None
+        found.append(Problem(kind, what, units, span, step, effects))
+    return found

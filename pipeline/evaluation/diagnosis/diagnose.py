@@ -1,0 +1,283 @@
+"""Diagnose which physical effect the model of a sensor lacks.
+
+``turntable`` or, for rests and moves by hand, ``multi_position`` selects effects and returns ``Findings``.
+``diagnosis_of`` states them as a diagnosis, which ``verdict`` compares with the error on held-out motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.evaluation.diagnosis import multi_position, turntable
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, diagnosis_of
+from pipeline.evaluation.diagnosis.possible import without_impossible
+from pipeline.evaluation.diagnosis.verdict import (
+    EXPLAINED,
+    MAX_UNKNOWN_PROBABILITY,
+    HeldOutError,
+    VerdictInput,
+    judged,
+    may_be_unknown,
+)
+from pipeline.core.errors import ConvergenceError, NotObservableError
+from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
+from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
+from pipeline.estimation.free_curves import OTHER_PREFIX
+from pipeline.estimation.noise import with_noises
+from pipeline.estimation.rest_means import is_multi_position
+from pipeline.estimation.stages import last_fit
+from pipeline.physics.calibration_file import not_determined
+from pipeline.physics.effects import catalogue, effect
+from pipeline.core.records import MATRIX, Noise, Recording, SensorCalibration, SensorDiagnosis, SensorValidation
+from pipeline.core.settings import Uncertainty
+from pipeline.evaluation.held_out.heldout import last_error, static_error
+from pipeline.evaluation.held_out.samples import HeldOutCase
+from pipeline.core.verdicts import Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from pipeline.core.settings import Effects, Settings
+
+
+# an accelerometer whose mountings may be wrong
+IN_DOUBT = Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED
+LEANING = ("mounting", "table_axis_nonorthogonality")  # effects that tilt a turn axis in the body
+ERRORS_OUTSIDE_UNCERTAINTY = (
+    "bias",
+    "scale_factor",
+    "non_orthogonality",
+    "rotation",
+)  # errors of a method that its uncertainty excludes
+
+
+def diagnose(
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    settings: Settings,
+    accelerometer: SensorCalibration | None = None,
+    *,
+    validation: SensorValidation | None = None,
+    gravity: SensorDiagnosis | None = None,
+    moves: tuple[float, float] | None = None,
+) -> SensorDiagnosis:
+    """Return the diagnosis of a sensor.
+
+    ``calibration``: the fits start from its effects. ``recordings``: all of the unit; those of role ``validation`` take
+    no part in the selection. ``accelerometer``: the unit's other calibration, which a gyroscope by hand needs for the
+    direction of gravity. ``validation``: of the calibration; without it, a free fit replaces the calibration.
+    ``gravity``: for a gyroscope, the diagnosis of the accelerometer. ``moves``: for a gyroscope by hand,
+    ``Validation.moves_error``.
+    """
+    sensor, settings = calibration.sensor, settings.replaced(uncertainty=Uncertainty(monte_carlo=0))
+    by_hand = is_multi_position(sensor, recordings)
+    procedure = multi_position if by_hand else turntable
+    configured = configured_effects(sensor, settings, [] if by_hand else recordings)
+    by_gravity = sensor == "gyroscope" and MOUNTING in configured
+    leaning = {} if by_hand or sensor == "accelerometer" else _leaning(gravity, accelerometer)
+    if by_gravity:
+        accelerometer = _mountings_by_gravity(recordings, settings)
+    elif not by_hand:  # an accelerometer's fit is no prior of its own mountings
+        accelerometer = None
+    case = DiagnosisInput(calibration, recordings, noise, settings, accelerometer, configured)
+    full = settings.diagnosis.depth == "full"
+
+    def judge(findings: Findings | None, found: SensorDiagnosis) -> tuple[SensorDiagnosis, bool]:
+        """Return the diagnosis with its verdict, and whether to search for a formula outside the catalogue."""
+        evidence = evidence_of(found, case, validation, findings)
+        doubts = list(evidence.doubts)
+        if by_gravity and gravity:
+            doubts += _doubts_of_gravity(gravity, case)
+        elif not leaning.keys() & {*configured, *found.selected}:
+            doubts += _doubts_of_axes(leaning, calibration)
+        evidence = replace(evidence, doubts=doubts, moves=moves, scatter=_scatter(calibration))
+        found = judged(found, evidence)
+        return without_impossible(found, case), full or may_be_unknown(found.verdict, evidence)
+
+    try:
+        findings = procedure.findings(case)
+    except NotObservableError as reason:
+        return judge(None, _not_enough_data(sensor, configured, reason.message, procedure.NEEDED_RECORDING))[0]
+    diagnosis, unknown = judge(findings, diagnosis_of(findings, case))
+    if unknown and findings.search:
+        findings = findings.search() or findings
+        diagnosis, _ = judge(findings, diagnosis_of(findings, case))
+    if findings.deeper and (full or diagnosis.verdict != Verdict.NOTHING_MISSING):
+        diagnosis = replace(diagnosis, further=findings.deeper())
+    return diagnosis
+
+
+def _scatter(calibration: SensorCalibration) -> float:
+    """Return the scatter of moves or directions that a fit by hand found, over the noise; 0 for other fits."""
+    found = [
+        stage.details.get(f"scatter_of_{kind}") for stage in calibration.stages for kind in ("moves", "directions")
+    ]
+    return max((float(value) for value in found if value), default=0.0)
+
+
+def held_out_of(validation: SensorValidation) -> HeldOutError | None:
+    """Return the last error of a sensor's validation; None without held-out motion or without an interval."""
+    error = validation.steps[-1].rms_error
+    if not validation.held_out or validation.expected_rms_error is None or error is None:
+        return None
+    return HeldOutError(error, *validation.expected_rms_error)
+
+
+def doubts_of(sensor: str, recordings: Sequence[Recording], *, seats: bool = True) -> list[str]:
+    """Return the notes of the recordings that contradict the reference of a sensor.
+
+    Notes on turns of the other sensor do not count. ``seats``: whether the note counts that the turns had different
+    mountings.
+    """
+    codes = {"N-REFERENCE", "N-SEATS"} if seats else {"N-REFERENCE"}
+    relevant = [r for r in recordings if r.role not in {"accelerometer", "gyroscope"} or r.role == sensor]
+    return [f"{r.name}: {note.detail}" for r in relevant for note in r.notes if note.code in codes]
+
+
+def evidence_of(
+    found: SensorDiagnosis, case: DiagnosisInput, validation: SensorValidation | None, findings: Findings | None
+) -> VerdictInput:
+    """Return the evidence for the verdict on ``found``, the diagnosis by the selection alone.
+
+    The held-out errors of the free fits are computed only if that of the calibration is above its interval.
+    """
+    sensor, recordings, settings = case.sensor, case.recordings, case.settings
+    free, full = (findings.free, findings.full) if findings else (None, None)
+
+    def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOutError | None:
+        if fit is None or case.noise is None or findings is None:
+            return None
+        try:
+            held_out = HeldOutCase(fit(), recordings, case.noise, settings, findings.other)
+            error = last_error(held_out, held_out.held_out_samples(smoothed=smoothed))
+        except ConvergenceError:  # the fit's effects cannot be subtracted from the held-out readings
+            return None
+        return None if error is None else HeldOutError(error[0], *error[1])
+
+    static = None
+    if case.noise is not None:
+        static = static_error(HeldOutCase(case.calibration, recordings, case.noise, settings, case.accelerometer))
+    accepted = settings.sensor.of(sensor).accept_implausible
+    published = held_out_of(validation) if validation else error_of(free, smoothed=False)
+    contradicted = published is not None and published.above
+    return VerdictInput(
+        sensor,
+        found.verdict,
+        tuple(found.selected),
+        found.residual_over_noise,
+        findings.left_over_noise if findings else None,
+        published=published,
+        static=HeldOutError(static[0], *static[1]) if static else None,
+        agreement=validation.agreement if validation else None,
+        free=error_of(free, smoothed=True) if contradicted else None,
+        full=error_of(full, smoothed=True) if contradicted else None,
+        doubts=[
+            *doubts_of(sensor, recordings, seats=not _seats_explained(found, sensor, findings)),
+            *(findings.departures if findings else ()),
+        ],
+        approximations=[error.name for error in found.method_errors if error.name in ERRORS_OUTSIDE_UNCERTAINTY],
+        unknown=[entry.covariate for entry in found.unexplained if not entry.explained_by],
+        beyond=[
+            name.removeprefix(OTHER_PREFIX)
+            for name, probability in found.probability.items()
+            if name.startswith(OTHER_PREFIX) and probability > MAX_UNKNOWN_PROBABILITY
+        ],
+        implausible=() if accepted else [entry.effect for entry in found.chosen if not entry.plausible],
+        held_out=found.on_table.held_out if found.on_table else None,
+        method=settings.method.of(sensor) or "",
+        fit=last_fit(case.calibration),
+        as_printed=settings.method.as_printed,
+        filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
+        held_by_limit=not_determined(case.calibration.to_json()) if settings.procedure.sheet else "",
+        on_table=findings is None or findings.on_table,
+    )
+
+
+def _seats_explained(found: SensorDiagnosis, sensor: str, findings: Findings | None) -> bool:
+    """Return whether the fit explains why turns seem to have different mountings.
+
+    Either mountings or zeros of the angle are in the model or selected. Or they were candidates of the accelerometer,
+    were not selected, and the residual is noise: then another effect looked like a mounting to the checks.
+    """
+    if any(effect(name).of_turns for name in (*found.configured, *found.selected)):
+        return True
+    residual = None if findings is None else findings.left_over_noise
+    return sensor == "accelerometer" and residual is not None and residual <= EXPLAINED
+
+
+def _doubts_of_gravity(accelerometer: SensorDiagnosis, case: DiagnosisInput) -> list[str]:
+    """Return why the mountings that the accelerometer determines may be wrong, from its diagnosis.
+
+    A missing tilt of the table causes no doubt if it shifts no mounting by more than the mounting's uncertainty.
+    """
+    subject = "the accelerometer, which determines the mountings,"
+    if accelerometer.verdict in IN_DOUBT:
+        return [f"{subject} has the verdict {accelerometer.verdict}"]
+    missing = [name for name in accelerometer.selected if of_the_angle(name)]
+    if not missing or (missing == [TILT] and _tilt_is_within_uncertainty(case)):
+        return []
+    remedy = "an error of the table that shifts the mountings: add it to effects.accelerometer"
+    return [f"{subject} misses {' and '.join(missing)}, {remedy}"]
+
+
+def _tilt_is_within_uncertainty(case: DiagnosisInput) -> bool:
+    """Return whether a fitted tilt of the table shifts each mounting by gravity by less than its U."""
+    effects, fit = case.settings.effects, case.accelerometer
+    listed = effects.accelerometer
+    with_tilt = effects.replaced(accelerometer=[*([] if listed == AUTO else listed), TILT])
+    other = _mountings_by_gravity(case.recordings, case.settings.replaced(effects=with_tilt))
+    if fit is None or other is None or fit.covariance is None:
+        return False
+    before, after = ({e.name: e.values for e in each.effects}[MOUNTING] for each in (fit, other))
+    mountings = fit.parameters.select(fit.parameters.of_effect(MOUNTING))
+    return bool(np.all(np.abs(after - before) < mountings.expanded_uncertainty))
+
+
+def _mountings_by_gravity(recordings: Sequence[Recording], settings: Settings) -> SensorCalibration | None:
+    return mountings_by_gravity(with_noises(recordings, settings.sensor, ("accelerometer",)), settings)
+
+
+def _leaning(diagnosis: SensorDiagnosis | None, fit: SensorCalibration | None) -> dict[str, float]:
+    """Return the largest tilt of a turn axis by each such effect that an accelerometer has or misses, deg."""
+    chosen, effects = diagnosis.chosen if diagnosis else (), fit.effects if fit else ()
+    values = {entry.effect: [p.value for p in entry.parameters.values()] for entry in chosen}
+    values |= {each.name: each.values.tolist() for each in effects}
+    return {name: max(map(abs, values[name])) for name in LEANING if name in values}
+
+
+def _doubts_of_axes(leaning: Mapping[str, float], calibration: SensorCalibration) -> list[str]:
+    """Return the tilts of the turn axes that exceed the matrix's U: to a gyroscope they look like a misalignment."""
+    if calibration.covariance is None:
+        return []
+    U = np.degrees(2.0 * float(np.max(calibration.parameters.standard_uncertainty[MATRIX])))
+    return [
+        f"by the accelerometer's {name} the turn axes lean by up to {size:.2g} deg, and the matrix of the gyroscope is "
+        f"off by as much ({np.radians(size):.2g}), beyond its uncertainty"
+        for name, size in leaning.items()
+        if size > U
+    ]
+
+
+def without_diagnosis(sensor: str, effects: Effects, code: str, message: str) -> SensorDiagnosis:
+    """Return the diagnosis of a sensor whose diagnosis failed with an error of this code and message.
+
+    The verdict is ``not_enough_data``, because nothing is known of what is missing.
+    """
+    listed = effects.of(sensor)
+    bug = code == "internal_error"
+    remedy = "report this fault with the traceback, which is in the log of the stage diagnose" if bug else ""
+    found = _not_enough_data(sensor, [] if listed == AUTO else list(listed), "", remedy)
+    reason = f"The diagnosis failed: {message}. The calibration does not depend on it."
+    return replace(found, details={"failed": message}, reason=reason, not_observable={})
+
+
+def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: str) -> SensorDiagnosis:
+    """Return the diagnosis for recordings that cannot show any effect; ``needed``: what to record."""
+    names = [name for name, each in catalogue().items() if sensor in each.sensors and name not in configured]
+    return SensorDiagnosis(
+        Verdict.NOT_ENOUGH_DATA, configured, not_observable=dict.fromkeys(names, reason), next_experiment=needed
+    )

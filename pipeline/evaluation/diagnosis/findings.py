@@ -1,0 +1,239 @@
+"""State the result of a selection, on a table or by hand, as a document.
+
+A noise model with bias wander can take up a missing effect. So the standard deviation of the fitted wander, ``sigma =
+q s`` with its ratio q to the white noise s, is compared with that of the rests or the sensor file:
+
+    inflated:   sigma > 3 sigma_expected   and   log L(best) - max {log L(q, tau): q s <= 3 sigma_expected} > 5
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.evaluation.diagnosis.verdict import if_observable
+from pipeline.evaluation.diagnosis.words import experiment_of, listed, of_unknown, plain, to_distinguish
+from pipeline.estimation.design import EffectColumns, placed
+from pipeline.estimation.free_curves import OTHER_PREFIX
+from pipeline.estimation.gates import MIN_DELTA_BIC
+from pipeline.estimation.known_effects import known_effects
+from pipeline.estimation.posterior import CERTAIN, Answers
+from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
+from pipeline.physics.effects import catalogue, effect
+from pipeline.core.records import Answer, Candidate, Estimate, SensorDiagnosis, Wander, standard_uncertainty
+from pipeline.core.verdicts import Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from pipeline.estimation.gauss_markov import Setting
+    from pipeline.estimation.ranking import Score
+    from pipeline.core.records import (
+        Dependence,
+        MethodError,
+        Noise,
+        Recording,
+        SensorCalibration,
+        TableEvidence,
+        Values,
+    )
+    from pipeline.core.settings import DataSheet, Settings
+
+LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings
+
+
+@dataclass(frozen=True)
+class DiagnosisInput:
+    """The input of a diagnosis; see ``diagnose``."""
+
+    calibration: SensorCalibration
+    recordings: Sequence[Recording]
+    noise: Noise | None
+    settings: Settings
+    accelerometer: SensorCalibration | None
+    configured: list[str]  # effects in the model: those that the settings list, and those of the bench
+
+    @property
+    def sensor(self) -> str:
+        """The sensor."""
+        return self.calibration.sensor
+
+    @property
+    def modelled(self) -> list[str]:
+        """Effects in the model, and effects with known parameters."""
+        return [*self.configured, *(e.name for e in known_effects(self.sensor, self.settings.method))]
+
+    @property
+    def data_sheet(self) -> DataSheet:
+        """The figures of the sensor."""
+        return self.settings.sensor.of(self.sensor)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Findings:
+    """The result of a selection, and the scores of all candidates."""
+
+    sensor: str
+    selected: Sequence[str]
+    verdict: Verdict  # by the selection alone
+    steps: Mapping[str, Score]  # of each selected effect when it was accepted
+    alone: Mapping[str, Score]  # of each candidate given base and configured effects
+    terms: Sequence[EffectColumns]  # configured and selected effects with their fitted values
+    covariance: Values  # of that fit; the parameters of the effects come last
+    limits: Mapping[str, Values]  # of plausibility
+    answers: Answers
+    shares: Callable[[str], Mapping[str, float]]  # share of an effect's fitted signal that each other one reproduces
+    squares: Sequence[float]  # sum or mean of squared residuals of the base, and with each further selected effect
+    drop_alone: Callable[[str], float]  # reduction of the first of these by an effect that was not selected
+    excess: float  # of the first of these over the noise
+    held_out: Sequence[float | None]  # held-out rms error, of the same fits as ``squares``
+    hidden: Mapping[str, str]  # reason why an effect is not observable
+    unknown: Sequence[Dependence]
+    over_noise: float | None  # rms residual of the base over the noise
+    left_over_noise: float | None  # the same with the selected effects
+    noises: Sequence[tuple[Setting, float]]  # noise settings and log L
+    white: float  # noise, unit of the sensor
+    expected_wander: float | None
+    advice: Callable[[Verdict], str]  # what to record next if no effect was selected, by the verdict
+    free: Callable[[], SensorCalibration] | None = None  # by a free fit of the same recordings
+    full: Callable[[], SensorCalibration] | None = None  # the same with the selected effects, if there are any
+    other: SensorCalibration | None = None  # of the other sensor
+    on_table: bool = True
+    departures: Sequence[str] = ()  # differences of faces and turns by hand from those that are stated
+    scatter_over_noise: float | None = None  # of the rests
+    method_errors: Sequence[MethodError] = ()
+    suggested_effect: Mapping[str, Any] | None = None  # content of an effect file
+    table_evidence: TableEvidence | None = None
+    details: Mapping[str, Any] = field(default_factory=dict)  # further entries of the document
+    turns: Mapping[str, str] = field(default_factory=dict)  # recordings for which effects of turns have parameters
+    search: Callable[[], Findings | None] | None = None  # for a formula outside the catalogue; returns None without one
+    deeper: Callable[[], dict[str, Any]] | None = None  # further entries of the document if something is missing
+
+
+def diagnosis_of(findings: Findings, case: DiagnosisInput) -> SensorDiagnosis:
+    """Return the diagnosis of a sensor, with the verdict by the selection alone."""
+    listed = [name for name in case.configured if name in case.settings.effects.of(case.sensor)]
+    others = sorted(findings.alone.values(), key=lambda score: -score.delta_bic)
+    unselected = [s.name for s in others if s.name not in findings.selected and s.name not in findings.hidden]
+    ranking = [_entry(findings, name) for name in (*findings.selected, *unselected)]
+    verdict = if_observable(findings.verdict, ranking, findings.hidden)
+    override = f"effects.{case.sensor}=[{','.join([*listed, *findings.selected])}]"
+    answers = findings.answers
+    sets = [Answer(names, min(p, CERTAIN)) for names, p in answers.answer_set()]
+    return SensorDiagnosis(
+        verdict=verdict,
+        configured=case.configured,
+        residual_over_noise=findings.over_noise,
+        selected=findings.selected,
+        ranking=ranking,
+        probability={name: min(answers.probability(name), CERTAIN) for name in answers.upper_limit},
+        answer_set=sets,
+        upper_limit=_upper_limits(findings),
+        to_distinguish=to_distinguish(sets, findings.sensor, on_table=findings.on_table),
+        not_observable=findings.hidden,
+        unexplained=findings.unknown,
+        suggested_effect=findings.suggested_effect,
+        next_experiment=next_experiment(verdict, ranking, findings),
+        override=override if findings.selected else "",
+        wander=_wander(findings),
+        method_errors=findings.method_errors,
+        on_table=findings.table_evidence,
+        details=findings.details,
+    )
+
+
+def next_experiment(verdict: Verdict, ranking: Sequence[Candidate], findings: Findings) -> str:
+    """Return the most informative next experiment as one sentence."""
+    on_table = findings.on_table
+    if verdict == Verdict.UNEXPLAINED:
+        return of_unknown(findings.unknown, on_table=on_table) if findings.unknown else findings.advice(verdict)
+    if not findings.selected:
+        if verdict == Verdict.NOTHING_MISSING and findings.answers.sets[0][0]:
+            pair = findings.answers.sets[0], ((), dict(findings.answers.sets).get((), 0.0))
+            sets = [Answer(names, min(p, CERTAIN)) for names, p in pair]
+            return f"to distinguish {to_distinguish(sets, findings.sensor, on_table=on_table)}"
+        return findings.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
+    entries = {entry.effect: entry for entry in ranking}
+
+    def alike(name: str) -> list[str]:
+        return [n for n in entries[name].look_alikes if name not in getattr(catalogue().get(n), "contains", ())]
+
+    name = next((n for n in findings.selected if alike(n)), findings.selected[0])
+    experiment = experiment_of(name, on_table=on_table)
+    others = listed([plain(other) for other in alike(name)[:2]], "or")
+    return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
+
+
+def _upper_limits(findings: Findings) -> dict[str, dict[str, tuple[float, str]]]:
+    """Return the upper limits of the parameters of effects that were not selected, with their units."""
+    limits = {}
+    for name, values in findings.answers.upper_limit.items():
+        if name in findings.selected or name.startswith(OTHER_PREFIX):
+            continue
+        this = effect(name).of_recordings(findings.turns)
+        linear = [p for p in this.parameters(findings.sensor) if p.name not in this.nonlinear or this.moves]
+        limits[name] = {p.name: (float(v), p.unit) for p, v in zip(linear, values, strict=True)}
+    return limits
+
+
+def _entry(findings: Findings, name: str) -> Candidate:
+    """Return the entry of an effect in the ranking."""
+    score = findings.steps.get(name) or findings.alone[name]
+    if name in findings.selected:
+        step = findings.selected.index(name)
+        before, after = findings.held_out[step : step + 2]
+        drop = findings.squares[step] - findings.squares[step + 1]
+    else:
+        before, after, drop = None, None, findings.drop_alone(name)
+    excess = max(findings.excess, drop)
+    estimates, plausible = _estimates(findings, score)
+    shares = findings.shares(name) if score.delta_bic > MIN_DELTA_BIC else {}
+    alike = sorted(((share, other) for other, share in shares.items() if share > LOOK_ALIKE_SHARE), reverse=True)
+    return Candidate(
+        effect=name,
+        delta_bic=score.delta_bic,
+        p_value=score.p_value,
+        parameters=estimates,
+        explained_share=float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0.0 else 0.0,
+        held_out_error_before=before,
+        held_out_error_after=after,
+        look_alikes={other: share for share, other in alike},
+        plausible=plausible,
+        meaning=effect(name).meaning if effect(name).definition else None,
+    )
+
+
+def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Estimate], bool]:
+    """Return the parameters of an effect and whether they are plausible: if selected, by the fit of all selected."""
+    values, uncertainty, plausible = score.values, score.uncertainty, score.plausible
+    if score.name in findings.selected:
+        base = len(findings.covariance) - sum(len(term.values) for term in findings.terms)
+        term, block = placed(findings.terms, base)[score.name]
+        values, uncertainty = term.values, standard_uncertainty(findings.covariance)[block]
+        if score.name in findings.limits:
+            plausible = bool(np.all(np.abs(values) - 2.0 * uncertainty <= findings.limits[score.name]))
+    described = effect(score.name).of_recordings(findings.turns).parameters(findings.sensor)
+    return {
+        p.name: Estimate(float(v), p.unit, float(u) if u > 0 else None)
+        for p, v, u in zip(described, values, uncertainty, strict=True)
+    }, plausible
+
+
+def _wander(findings: Findings) -> Wander:
+    """Return the most likely wander, given base, configured and selected effects, and whether it is inflated."""
+    wander, best = max(findings.noises, key=lambda noise: noise[1])
+    inflated = False
+    if findings.expected_wander is not None:
+        limit = INFLATED * max(findings.expected_wander / findings.white, LEAST_RATIO)
+        believed = [score for setting, score in findings.noises if setting.ratio <= limit]
+        inflated = wander.ratio > limit and (not believed or best - max(believed) > EVIDENCE)
+    return Wander(
+        ratio=float(wander.ratio),
+        time_s=float(wander.time) if wander.ratio else None,
+        standard_deviation=float(wander.ratio * findings.white),
+        expected=findings.expected_wander,
+        inflated=bool(inflated),
+        scatter_over_noise=findings.scatter_over_noise,
+    )

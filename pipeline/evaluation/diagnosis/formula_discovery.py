@@ -1,0 +1,376 @@
+"""Search for a formula of physics outside the catalogue, and write it as an effect file.
+
+Every form of the grammar (``pipeline.evaluation.diagnosis.functional_forms``) is scored as an effect would be: base and effects
+are projected out, and the noise is that of the engine. On the a axes that it improves, its score is
+
+    2 (max log L' - max log L) - (r a + s) log N - 2 C log 10
+
+with r coefficients, s scanned constants, N readings and complexity C: each choice of the grammar is one of about ten.
+Constants are scanned coarsely, then more finely about the best. Further terms are added if their scores are clear.
+
+The search is made in addition to the selected effects, and again without them, since they may have been selected
+instead of the form. With the form in the base, effects are selected again. Of these models and the catalogue's alone,
+the one with the least
+
+    -2 log L + k log N + 2 C log 10
+
+is reported, with k parameters of effects and scanned constants. Stability is the share of resamples in which the form
+has the best score of all finalists. Each resample leaves out one recording, or a fifth of every recording. The front
+lists, by complexity, the forms that gain more than all simpler ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import chain, count
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.evaluation.diagnosis import functional_forms as forms
+from pipeline.evaluation.diagnosis.functional_forms import Form, Span
+from pipeline.evaluation.diagnosis.residual_dependence import dependences
+from pipeline.evaluation.diagnosis.residual_regression import FormGain, ProjectedCurves, Scan
+from pipeline.evaluation.diagnosis.words import listed
+from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.gates import MAX_MIN_DELTA_BIC, MIN_DELTA_BIC
+from pipeline.estimation.generalized_least_squares import fit_terms
+from pipeline.estimation.observations import without_each_recording, without_rows
+from pipeline.estimation.selection import FAR_ABOVE, Selection, select
+from pipeline.physics.effects import catalogue, effect_from, forget, register
+from pipeline.physics.effects.base import unit_of
+from pipeline.physics.formula import SIGNALS, parse
+from pipeline.core.records import Dependence, FittedForm, RankedFormula
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Mapping, Sequence
+
+    from pipeline.evaluation.diagnosis.findings import DiagnosisInput
+    from pipeline.core.records import Values
+
+PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
+# least delta BIC of a further term over that of the first: less may be rounding of the first's constants
+MIN_FURTHER_GAIN_SHARE = 0.02
+MAX_FORMULA_TERMS = 3
+REFINED = 16  # forms that are scored under every noise setting, and whose constants are scanned more finely
+SCAN_REFINEMENTS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
+VALUES_AT_ONCE = 4_000_000  # of columns that are scanned together: 32 MB
+PROBED = 200  # rows; two forms whose values there are equal to 1e-9 are one
+LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
+OBSERVABLE_BY = {"temperature": "bias_temperature"}  # effect that is observable if the recordings vary the covariate
+FINALISTS = 8  # forms that are compared in the resamples
+RECORDING_FOLDS = 5  # parts of every recording that are left out in turn
+LISTED_FORMULAS = 6  # entries of the front
+
+
+@dataclass(frozen=True)
+class ScoredForm:
+    """A form and its gain."""
+
+    form: Form
+    gain: FormGain
+
+    @property
+    def score(self) -> float:
+        """Delta BIC minus the price of the form's complexity."""
+        return self.gain.delta_bic - PRICE * self.form.complexity
+
+    @property
+    def clear(self) -> bool:
+        """Whether its score passes the gate; a form in time and temperature alone looks like unmodelled wander."""
+        return self.score > (MAX_MIN_DELTA_BIC if self.form.signals <= {"time", "temperature"} else MIN_DELTA_BIC)
+
+
+class Forms:
+    """The forms that a unit's recordings can show, and the gain of each in addition to a fit."""
+
+    def __init__(self, selection: Selection) -> None:
+        self.selection, self.sensor = selection, selection.observations.sensor
+        self._columns: dict[str, Values] = {}
+        self.explain(())
+
+    def explain(self, formulas: Sequence[str]) -> None:
+        """Project formulas out of the residual and of all forms from now on."""
+        self.explained = forms.columns_of(formulas, self.sensor) if formulas else None
+        self.scan = Scan(self.selection, self.explained)
+
+    def column(self, text: str) -> Values:
+        """Return a formula's values: (n, 1) array, or (n, 3) if the formula contains ``u``."""
+        if text not in self._columns:
+            self._columns[text] = self.scan.values(forms.columns_of([text], self.sensor))[:, :, 0]
+        return self._columns[text]
+
+    def columns(self, form: Form) -> Values:
+        """Return the values of a form's columns: (n, 1, r) or (n, 3, r) array."""
+        columns = np.stack([self.column(text) for text in form.factor.texts], axis=-1)
+        return columns * self.column(form.modulator.texts[0])[:, :, None] if form.modulator else columns
+
+    def gains(self, tried: Sequence[Form], *, coarse: bool = False) -> list[FormGain]:
+        """Return the gain of each form; ``coarse``: under the noise of the fit, the least wander and a middle one."""
+        scan = self.scan
+        if coarse:
+            ordered = sorted(self.selection.settings, key=lambda setting: setting.ratio)
+            few = dict.fromkeys([self.selection.fit.setting, ordered[0], ordered[len(ordered) // 2]])
+            scan = Scan(replace(self.selection, settings=[*few]), self.explained)
+        found: dict[int, FormGain] = {}
+        alike: dict[tuple[int, int], list[int]] = {}  # forms whose columns have the same shape
+        for k, form in enumerate(tried):
+            alike.setdefault((len(form.factor.texts), 3 if "u" in form.signals else 1), []).append(k)
+        for (r, axes), members in alike.items():
+            size = max(8, VALUES_AT_ONCE // (len(self.selection.observations.weight) * r * axes))
+            for first in range(0, len(members), size):
+                some = members[first : first + size]
+                columns = np.stack([self.columns(tried[k]) for k in some], axis=-2)
+                scanned = np.array([tried[k].scanned for k in some])
+                found |= dict(zip(some, scan.best_axes(scan.drops(columns), r, scanned), strict=True))
+        return [found[k] for k in range(len(tried))]
+
+    def ranked(self) -> list[ScoredForm]:
+        """Return the best form of each name, best score first."""
+        spans = self._spans
+        best = _best_of_each(map(ScoredForm, self._tried, self.gains(self._tried, coarse=True)))[:REFINED]
+        refined = [each.form for each in best]
+        best = _best_of_each(map(ScoredForm, refined, self.gains(refined)))
+        for spacing in SCAN_REFINEMENTS:
+            near = [
+                Form(factor, each.form.modulator)
+                for each in best
+                if each.form.factor.signal in spans
+                for factor in forms.finer(each.form.factor, spans[each.form.factor.signal], spacing)
+            ]
+            best = _best_of_each([*best, *map(ScoredForm, near, self.gains(near))])
+        return _best_of_each([*best, *(self._polynomial(span) for span in [*spans.values(), None])])
+
+    @cached_property
+    def _spans(self) -> dict[str, Span]:
+        observations = self.selection.observations
+        names = ["fx", "fy", "fz", *forms.available_signals(observations)]
+        return {name: Span.of(observations, name) for name in names}
+
+    @cached_property
+    def _tried(self) -> list[Form]:
+        """Return the forms of the coarse scan without those of the catalogue; of equal forms the simplest."""
+        spans = self._spans
+        turning = any(part.motion.axis is not None for part in self.selection.observations.parts)
+        factors = forms.factors(spans, turning=turning)
+        pairs = [
+            Form(factor, modulator)
+            for modulator in forms.modulators(spans)
+            for factor in factors
+            if modulator is None or factor.signal != modulator.signal or factor.kind == "step"
+        ]
+        rows = np.random.default_rng(0).integers(len(self.selection.observations.weight), size=PROBED)
+        declared = [getattr(e, "declared", None) for e in catalogue().values() if self.sensor in e.sensors]
+        terms = [term for each in declared if each for term in each.terms.values()]
+        known = [term.formulas[""].text for term in terms if "" in term.formulas and not term.shared]
+        seen = {_digest(self.column(text)[rows]) for text in known}
+        distinct = []
+        for form in sorted(pairs, key=lambda form: form.complexity):
+            digest = _digest(self.columns(form)[rows])
+            if digest not in seen:
+                seen.add(digest)
+                distinct.append(form)
+        return distinct + [Form(band) for band in (forms.bands(spans["speed"]) if "speed" in spans else [])]
+
+    def _polynomial(self, span: Span | None) -> ScoredForm:
+        """Return the polynomial of the best order, without powers that base or effects contain; None: in ``u``."""
+        signal, of_u = ("u", "fz" if self.sensor == "accelerometer" else "wz") if span is None else (span.signal, "")
+        texts = forms.powers(span or Span.of(self.selection.observations, of_u), signal)
+        projected = ProjectedCurves(self.scan, forms.columns_of(texts, self.sensor))
+        new = projected.independent(range(len(texts)))
+        drops = projected.drop(new) if new else np.zeros((*self.scan.left.shape, 1))
+        gains = self.scan.best_axes(drops, np.arange(1, drops.shape[2] + 1))
+        best = max(range(len(gains)), key=lambda k: gains[k].delta_bic - PRICE * k)
+        index = new[: best + 1]
+        formulas = tuple(texts[k] for k in index)
+        return ScoredForm(Form(forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)), gains[best])
+
+
+def _digest(values: Values) -> bytes:
+    """Return the same bytes for forms whose values differ by a factor alone."""
+    flat, size = values.ravel(), float(np.linalg.norm(values))
+    first = float(flat[np.argmax(np.abs(flat) > 1e-6 * size)]) if size > 0.0 else 1.0
+    return np.round(values.reshape(len(values), -1) / (size * np.sign(first) or 1.0), 9).tobytes()
+
+
+def _best_of_each(scored: Iterable[ScoredForm]) -> list[ScoredForm]:
+    """Return the form with the best constants of each name, best score first."""
+    best: dict[tuple[str, ...], ScoredForm] = {}
+    for each in scored:
+        name = each.form.name
+        if name not in best or each.score > best[name].score:
+            best[name] = each
+    return sorted(best.values(), key=lambda each: -each.score)
+
+
+def search(selection: Selection) -> tuple[list[ScoredForm], list[ScoredForm]]:
+    """Return the terms of the best form, none if none is clear, and all forms of one term, best first."""
+    terms: list[ScoredForm] = []
+    grammar = Forms(selection)
+    first = ranked = grammar.ranked()
+    while (
+        ranked
+        and ranked[0].clear
+        and (not terms or ranked[0].gain.delta_bic > MIN_FURTHER_GAIN_SHARE * terms[0].gain.delta_bic)
+    ):
+        terms.append(ranked[0])
+        if len(terms) == MAX_FORMULA_TERMS:
+            break
+        grammar.explain([text for term in terms for text in term.form.formulas])
+        ranked = [each for each in grammar.ranked() if not any(each.form.refines(term.form) for term in terms)]
+    return terms, first
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """The result of a search outside the catalogue."""
+
+    context: Selection  # in whose residual the form was found
+    reported: Selection  # with the form in its base, if there is one
+    unknown: Sequence[Dependence]  # that with the form first
+    suggested: dict[str, Any] | None = None  # the effect's definition
+    front: Sequence[RankedFormula] = ()
+
+
+def why_not_suggested(discovery: Discovery, hidden: Mapping[str, str]) -> str | None:
+    """Return why the form is not offered as an effect: unstable, or of a signal whose effects are not observable."""
+    covariate = discovery.unknown[0].covariate
+    if covariate in OBSERVABLE_BY and OBSERVABLE_BY[covariate] in hidden:
+        return f"effects of the {covariate} are not observable: {hidden[OBSERVABLE_BY[covariate]]}"
+    stability = discovery.front[0].stability if discovery.front else None
+    if stability is not None and stability < LEAST_STABLE:
+        return f"it is not stable: another formula is the best in {100 * (1 - stability):.0f} % of the resamples"
+    return None
+
+
+def discover(selection: Selection, unknown: Sequence[Dependence], case: DiagnosisInput) -> Discovery:
+    """Search for a formula in addition to base, configured and selected effects.
+
+    ``unknown``: the ``dependences`` of the selection. No form is suggested if the residual with it is far above the
+    noise: then something else is missing.
+    """
+    noise = case.noise
+    floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
+    best, least = Discovery(selection, selection, unknown), _criterion(selection, []) + MIN_DELTA_BIC
+    alone = replace(selection, steps={}, fit=selection.base)
+    for context in [selection, alone] if selection.names else [selection]:
+        terms, ranked = search(context)
+        if not terms:
+            continue
+        found, first = _fitted_form(context, terms), terms[0]
+        entry = Dependence(first.form.covariate, first.gain.p_value, sum(term.gain.delta_bic for term in terms), found)
+        definition = suggested_effect(entry.covariate, found, case.sensor, catalogue())
+        form = effect_from(definition, "a first guess")
+        added = [*context.fit.terms, EffectColumns(form, np.zeros(len(form.parameters(case.sensor))))]
+        residual_rms = fit_terms(context.observations, added, context.start, context.settings).residual_rms
+        if 0.0 < FAR_ABOVE * floor < residual_rms:
+            continue
+        names = [*case.configured, form.name]
+        register(form)
+        try:
+            reselected = select(context.observations, names, noise, case.data_sheet, accelerometer=case.accelerometer)
+        finally:
+            forget(form.name)
+        criterion = _criterion(reselected, terms)
+        if criterion > least:
+            least, front = criterion, _front(context, terms, ranked)
+            best = Discovery(context, reselected, [entry, *unknown], definition, front)
+    fitted = best.unknown[0].form if best.unknown else None
+    return replace(best, unknown=_explained(best, fitted)) if fitted else best
+
+
+def _criterion(selection: Selection, terms: Sequence[ScoredForm]) -> float:
+    """Return 2 log L minus the price of all parameters and of the formula."""
+    fitted = sum(len(term.values) for term in selection.fit.terms) + sum(term.form.scanned for term in terms)
+    price = PRICE * sum(term.form.complexity for term in terms)
+    return 2.0 * selection.fit.log_likelihood - fitted * float(np.log(3.0 * selection.observations.samples)) - price
+
+
+def _fitted_form(selection: Selection, terms: Sequence[ScoredForm]) -> FittedForm:
+    """Return a form in words, with its formulas and their coefficients on each of its axes."""
+    sensor, first = selection.observations.sensor, terms[0]
+    texts = [text for term in terms for text in term.form.formulas]
+    projected = ProjectedCurves(Scan(selection), forms.columns_of(texts, sensor))
+    coefficients = projected.coefficients(range(len(texts)), terms[-1].gain.setting)
+    axes = sorted({axis for term in terms for axis in term.gain.axes})
+    edges = np.cumsum([len(term.form.formulas) for term in terms])[:-1]
+    of_terms = np.split(coefficients, edges, axis=1)
+    sizes = [forms.sizes_of(t.form, c, selection.observations) for t, c in zip(terms, of_terms, strict=True)]
+    words = [forms.described(t.form, size, t.gain.axes, sensor) for t, size in zip(terms, sizes, strict=True)]
+    return FittedForm(
+        shape=listed(words),
+        kind=first.form.kind,
+        axes=["xyz"[c] for c in axes],
+        formulas=texts,
+        units=[term.form.unit(sensor) for term in terms for _ in term.form.formulas],
+        coefficients=[coefficients[c].tolist() for c in axes],
+        size=float(np.abs(sizes[0][list(first.gain.axes)]).max()),
+        unit="1" if first.form.kind == "ripple" else unit_of(sensor),
+    )
+
+
+def _explained(found: Discovery, form: FittedForm) -> list[Dependence]:
+    """Return the dependences with the form's covariate where the form explains them too."""
+    first, *others = found.unknown
+    columns = forms.columns_of(form.formulas, found.context.observations.sensor)
+    remaining = {entry.covariate for entry in dependences(found.context, columns)}
+    others = [entry for entry in others if entry.covariate != first.covariate]
+    return [first, *(e if e.covariate in remaining else replace(e, explained_by=first.covariate) for e in others)]
+
+
+def _front(selection: Selection, terms: Sequence[ScoredForm], ranked: Sequence[ScoredForm]) -> list[RankedFormula]:
+    """Return the forms of one term that gain more than all simpler ones, and before them the suggested one."""
+    finalists = list(ranked[:FINALISTS])
+    stable = _stability(selection, finalists)
+    shown: list[ScoredForm] = []
+    for each in sorted(ranked, key=lambda each: (each.form.complexity + each.form.scanned, -each.gain.delta_bic)):
+        if not shown or each.gain.delta_bic > shown[-1].gain.delta_bic:
+            shown.append(each)
+    shown = [terms[0], *(each for each in shown if each.form is not terms[0].form)][:LISTED_FORMULAS]
+    return [
+        RankedFormula(
+            formula=" + ".join(each.form.formulas),
+            complexity=each.form.complexity,
+            constants=each.form.scanned,
+            delta_bic=each.gain.delta_bic,
+            score=each.score,
+            axes=["xyz"[c] for c in each.gain.axes],
+            stability=next((s for f, s in zip(finalists, stable, strict=True) if f.form is each.form), None),
+            suggested=each.form is terms[0].form,
+        )
+        for each in shown
+    ]
+
+
+def _stability(selection: Selection, finalists: Sequence[ScoredForm]) -> list[float]:
+    """Return the share of the resamples with a clear score in which each form has the best score."""
+    observations, lengths = selection.observations, [len(part.weight) for part in selection.observations.parts]
+    folds = ([np.arange(n) * RECORDING_FOLDS // n == fold for n in lengths] for fold in range(RECORDING_FOLDS))
+    resamples = chain(without_each_recording(observations), (without_rows(observations, rows) for rows in folds))
+    wins, counted = np.zeros(len(finalists)), 0
+    for resample in resamples:
+        gains = Forms(replace(selection, observations=resample)).gains([each.form for each in finalists])
+        scores = [ScoredForm(each.form, gain).score for each, gain in zip(finalists, gains, strict=True)]
+        if max(scores) > MIN_DELTA_BIC:
+            wins[int(np.argmax(scores))] += 1
+            counted += 1
+    return [float(share) for share in wins / max(counted, 1)]
+
+
+def suggested_effect(covariate: str, form: FittedForm, sensor: str, taken: Collection[str]) -> dict[str, Any]:
+    """Return the definition of an effect with the form of a dependence; its name differs from those in ``taken``."""
+    plain = f"unknown_{covariate}"
+    name = next(n for n in chain([plain], (f"{plain}_{k}" for k in count(2))) if n not in taken)
+    terms = zip("ABCDEFGHIJKL", form.formulas, form.units, strict=False)
+    signals = {signal for text in form.formulas for signal in parse(text).signals}
+    of_table = form.kind == "band" or any(not SIGNALS[signal].c for signal in signals)
+    return {
+        "name": name,
+        "owner": "table" if of_table else "recording" if "time" in signals else "sensor",
+        "sensors": [sensor],
+        "meaning": f"First guess, to be confirmed: the {sensor} shows {form.shape}."[:500],
+        "terms": {term: {"formula": formula, "unit": unit} for term, formula, unit in terms},
+        "axes": list(form.axes),
+        "source": "what a diagnosis found in the residual",
+    }

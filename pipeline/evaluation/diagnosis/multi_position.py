@@ -1,0 +1,333 @@
+"""Select the effects that the model of a sensor lacks, from rests and moves by hand.
+
+The residual of the rests is compared with white noise and the expected bias instability. How firmly the unit rested is
+unknown. So a larger scatter of the rests is reported, but alone it is no sign of a missing effect.
+
+Twenty rests are too few to hold some out of a selection. So the selection uses all of them, and cross-validation
+judges it: each of ``REST_FOLDS`` models leaves out every third rest with the move before it. ``held_out_error`` of a
+ranking is that of the selected effects, fitted without those rests. ``cross_validation`` also repeats the selection.
+
+The residual depends on time, temperature (powers 1 to 2 or 3 over their span) or the axis' own specific force
+(Chebyshev polynomials of degree 4 and 5) if such curves, with free coefficients on every axis, have delta BIC > 10 and
+m p < 1e-3, with m the number of all tests.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy
+
+from pipeline.evaluation.diagnosis import functional_forms as forms
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
+from pipeline.evaluation.diagnosis.method_errors import given_differences
+from pipeline.evaluation.diagnosis.observability import MORE_RESTS, never_shown, not_observable_by_hand
+from pipeline.evaluation.diagnosis.residual_dependence import significant
+from pipeline.evaluation.diagnosis.residual_plots import added_variable_of_rests
+from pipeline.evaluation.diagnosis.verdict import verdict_of_selection_by_hand
+from pipeline.evaluation.diagnosis.words import listed, plain
+from pipeline.core.errors import CannotCalibrateError, NotObservableError, PipelineError
+from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
+from pipeline.estimation.least_squares import ScaledColumns, cholesky
+from pipeline.estimation.multi_position.effects import model_of
+from pipeline.estimation.multi_position.fit import COMPARED_STEP, FitByHand, fit
+from pipeline.estimation.multi_position.likelihood import CEILING_TO, MIN_NEW_NORM_SHARE, log_likelihoods, project_out
+from pipeline.estimation.multi_position.model import NoiseHypothesis
+from pipeline.estimation.multi_position.result import calibration_of
+from pipeline.estimation.multi_position.selection import SelectionByHand, posterior
+from pipeline.estimation.noise import noise_of
+from pipeline.estimation.stages import is_given
+from pipeline.physics.effects import catalogue, effect_from
+from pipeline.core.records import Dependence, UnitRecordings
+from pipeline.core.verdicts import Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from pipeline.estimation.multi_position.model import Equations, Model, State
+    from pipeline.core.records import Mask, Noise, Recording, SensorCalibration
+    from pipeline.core.settings import Settings
+
+NEEDED_RECORDING = MORE_RESTS
+WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"
+REST_FOLDS = 3  # as every third rest is held out of a published fit (procedure.holdout_every)
+SPARE = 2  # least number of equations beyond the parameters in a fold
+LEAST_SPAN = 1.0  # s or degC: of a covariate
+FORCE = ("8 * u ** 4 - 8 * u ** 2 + 1", "16 * u ** 5 - 20 * u ** 3 + 5 * u")  # Chebyshev polynomials of u in g
+WORTH = 0.25  # least share of the residual's mean square that a possible cause explains at its limits
+MAX_NAMED_EFFECTS = 3  # effects in a sentence
+FIRM = 2.0  # times the noise: a larger scatter of the rests is reported
+
+
+def findings(case: DiagnosisInput) -> Findings:
+    """Return the findings of the selection in rests and moves by hand.
+
+    Raises ``NotObservableError`` if there are no rests, or if they do not determine bias and matrix.
+    """
+    model, calibration, noise = _model_of_all_rests(case), case.calibration, _without_creep(case)
+    given = calibration, case.configured, case.noise, case.data_sheet
+    selection = SelectionByHand(model, *given)
+    expected = NoiseHypothesis(WHITE_SETTING, (0.0,) * model.kinds)
+    if noise is not None:
+        ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
+        expected = replace(expected, bias=Setting(ratio, noise.correlation_time))
+    with_scatter = replace(expected, scatter=selection.fits[-1].noise.scatter)
+    hidden, unknown = not_observable_by_hand(selection, case.modelled), _dependences(selection)
+    chi = [float(np.sum(project_out(fit.equations, [with_scatter]).residual ** 2)) for fit in selection.fits]
+    moving = with_scatter if "slow" in model.rests.kinds else expected  # its accelerations are no missing effect
+    over, left_over = (_over_noise(model, selection.fits[k].equations, moving) for k in (0, -1))
+    verdict = verdict_of_selection_by_hand(selection.names, unknown, left_over)
+    scores = log_likelihoods(selection.fits[-1].equations, selection.hypotheses)
+    best = selection.hypotheses[int(np.argmax(scores))]
+    signal, folds = selection.first.signal, _folds(selection, lambda part: SelectionByHand(part, *given, COMPARED_STEP))
+
+    def calibrated(fit: FitByHand) -> SensorCalibration:
+        return calibration_of(model, fit, calibration, case.settings)
+
+    def advice(verdict: Verdict) -> str:
+        if verdict == Verdict.NOT_ENOUGH_DATA:
+            return f"{MORE_RESTS}{WITH_FACES if case.settings.procedure.faces else ''}"
+        if left_over is not None and (left_over > FIRM or verdict == Verdict.UNEXPLAINED):
+            return _of_scatter(_suspects(selection, hidden), left_over)
+        warmth = catalogue()["bias_temperature"]
+        return f"to make bias temperature observable: record {warmth.excitation}" if warmth.name in hidden else ""
+
+    return Findings(
+        sensor=case.sensor,
+        selected=selection.names,
+        verdict=verdict,
+        steps=selection.steps,
+        alone=selection.first.scores,
+        terms=selection.fits[-1].state.terms,
+        covariance=selection.fits[-1].covariance,
+        limits=selection.limits,
+        answers=posterior(selection, never_shown(hidden, selection.names)),
+        shares=lambda name: _shares(selection, name),
+        squares=chi,
+        drop_alone=lambda name: float(signal[name] @ signal[name]) if name in signal else 0.0,
+        excess=max(chi[0] - (len(selection.fits[0].residual) - selection.fits[0].rank), chi[0] - chi[-1]),
+        held_out=_held_out_errors(selection, folds),
+        hidden=hidden,
+        unknown=unknown,
+        over_noise=over,
+        left_over_noise=left_over,
+        noises=[(h.bias, score) for h, score in zip(selection.hypotheses, scores.tolist(), strict=True)],
+        white=float(np.sqrt(np.mean(model.white**2))),
+        expected_wander=None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
+        advice=advice,
+        full=(lambda: calibrated(selection.fits[-1])) if selection.names else None,
+        other=case.accelerometer if case.sensor == "gyroscope" else None,
+        on_table=False,
+        departures=[text for stage in calibration.stages for text in stage.details.get("departures", ())],
+        scatter_over_noise=float(best.scatter[0]),
+        method_errors=given_differences(
+            calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings
+        ),
+        details={
+            "pictures": {
+                "added_variable": added_variable_of_rests(selection) if selection.names else None,
+                "unexplained": [],
+            },
+            "cross_validation": _cross_validation(selection, folds),
+        },
+    )
+
+
+def _model_of_all_rests(case: DiagnosisInput) -> Model:
+    """Return the model with no rest held out.
+
+    The accelerometer is calibrated again by all rests, which shows rests that contradict the others, unless it has
+    effects or all rests do not determine it. One that is given stays as it is, because the gyroscope refers to it.
+    """
+    settings = case.settings.replaced(procedure=case.settings.procedure.replaced(holdout_every=0))
+
+    def with_all_rests(fitted: SensorCalibration, noise: Noise | None) -> SensorCalibration:
+        if fitted.effects:
+            return fitted
+        noise = noise or noise_of("accelerometer", case.recordings, settings.sensor.accelerometer)
+        recordings = UnitRecordings([*case.recordings], {"accelerometer": noise})
+        try:
+            return nonlinear_least_squares.fit(recordings, None, settings)
+        except PipelineError:
+            return fitted
+
+    calibration, other = case.calibration, None
+    if case.sensor == "accelerometer":
+        calibration = with_all_rests(calibration, case.noise)
+    elif case.accelerometer and is_given("accelerometer", settings.method):
+        other = case.accelerometer
+    elif case.accelerometer:
+        other = with_all_rests(case.accelerometer, None)
+    return require_model(case.recordings, calibration, case.noise, settings, other)
+
+
+def require_model(
+    recordings: Sequence[Recording],
+    calibration: SensorCalibration,
+    noise: Noise | None,
+    settings: Settings,
+    accelerometer: SensorCalibration | None = None,
+) -> Model:
+    """Return the model of rests and moves; see ``pipeline.estimation.multi_position.effects.model_of``.
+
+    Raises ``NotObservableError`` if there are no rests, or if they do not determine bias and matrix.
+    """
+    try:
+        model = model_of(recordings, calibration, noise, settings, accelerometer)
+    except CannotCalibrateError as lack:
+        raise NotObservableError(lack.message) from lack
+    if model is None:
+        raise NotObservableError(f"no recording holds a rest with readings of the {calibration.sensor}")
+    return model
+
+
+def _without_creep(case: DiagnosisInput) -> Noise | None:
+    """Return the noise, with the wander of the sensor file unless a static recording determined it.
+
+    In rests by hand a slow change of the attitude moves gravity between the axes and looks like a wander of the bias.
+    """
+    noise, data_sheet = case.noise, case.data_sheet
+    if noise is None or noise.source == "static":
+        return noise
+    wander = np.full(3, data_sheet.bias_wander)
+    time = data_sheet.wander_time_s
+    return replace(noise, wander=wander, correlation_time=time)
+
+
+def _shares(selection: SelectionByHand, name: str) -> dict[str, float]:
+    """Return the share of an effect's fitted signal that each other effect reproduces."""
+    scored = selection.own[name] if name in selection.names else selection.first
+    signal = scored.signal.get(name)
+    if signal is None or not signal.any():
+        return {}
+    power = float(signal @ signal)
+    others = {other: shown for other, shown in scored.shown.items() if other != name}
+    return {other: min(float(np.sum((shown.T @ signal) ** 2)) / power, 1.0) for other, shown in others.items()}
+
+
+def _over_noise(model: Model, equations: Equations, expected: NoiseHypothesis) -> float | None:
+    """Return the rms residual of the rests over that of noise alone; None without a degree of freedom."""
+    rests = slice(model.rests_equations)
+    L = cholesky(equations.covariance(expected)[rests, rests])
+    columns = np.asarray(np.linalg.solve(L, equations.columns[rests]), np.float64)
+    readings = np.asarray(np.linalg.solve(L, equations.residual[rests]), np.float64)
+    factors = ScaledColumns.of(columns, MIN_NEW_NORM_SHARE)
+    residual, freedom = readings - columns @ factors.solve(readings), len(readings) - factors.rank
+    return float(np.sqrt(residual @ residual / freedom)) if freedom > 0 else None
+
+
+def _held_out_errors(selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand, int]]) -> list[float | None]:
+    """Return the rms error, g or deg/s, of each fit of the selection on rests that are left out of it in turn."""
+    model = selection.model
+    if not folds:  # a recording for validation, or nothing is selected
+        return [model.held_out_error(each.state) for each in selection.fits] if selection.names else [None]
+    errors: list[float | None] = []
+    for k, each in enumerate(selection.fits):
+        fits = [
+            fold.fits[k]
+            if fold.names[:k] == selection.names[:k]
+            else fit(fold.model, each.state, selection.hypotheses, selection.bounds, small=COMPARED_STEP)
+            for fold, _ in folds
+        ]
+        judged = all(len(fitted.residual) >= fitted.rank + SPARE for fitted in fits)
+        squares = (held * _squared(fold.model, fitted.state) for (fold, held), fitted in zip(folds, fits, strict=True))
+        errors.append(float(np.sqrt(sum(squares) / len(model.rests.time))) if judged else None)
+    return errors
+
+
+def _cross_validation(
+    selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand, int]]
+) -> dict[str, Any] | None:
+    """Return the errors of the whole procedure, selection included, on rests that are left out of it in turn.
+
+    ``folds``, ``error_before, error_after`` (rms, g or deg/s), and ``named``: the number of folds that selected each
+    effect. None if there are no folds.
+    """
+    if not folds:
+        return None
+    named = Counter(name for fold, _ in folds for name in fold.names)
+    squares = [[held * _squared(fold.model, fold.fits[k].state) for k in (0, -1)] for fold, held in folds]
+    before, after = np.sqrt(np.sum(squares, axis=0) / len(selection.model.rests.time)).tolist()
+    return {"folds": REST_FOLDS, "error_before": before, "error_after": after, "named": dict(named)}
+
+
+def _folds(selection: SelectionByHand, select: Callable[[Model], SelectionByHand]) -> list[tuple[SelectionByHand, int]]:
+    """Return the selections that leave out every third rest in turn, each with the number of rests left out.
+
+    Empty if nothing was selected, or if there is a recording for validation.
+    """
+    model = selection.model
+    if not selection.names or model.held_out_error(selection.fits[0].state) is not None:
+        return []
+    held: list[Mask] = [np.arange(len(model.rests.time)) % REST_FOLDS == k for k in range(REST_FOLDS)]
+    return [(select(model.without(rests)), int(rests.sum())) for rests in held]
+
+
+def _squared(model: Model, state: State) -> float:
+    return (model.held_out_error(state) or 0.0) ** 2
+
+
+def _dependences(selection: SelectionByHand) -> list[Dependence]:
+    """Return the covariates on which the residual depends, the clearest first."""
+    model, rests = selection.model, selection.model.rests
+    tests: list[tuple[str, Sequence[str]]] = []  # covariate and formulas of its curves
+    for covariate, values in (("time", rests.time), ("temperature", rests.temperature)):
+        known = rests.clock_shared if covariate == "time" else not np.isnan(values).any()
+        if known and np.ptp(values) > LEAST_SPAN:
+            powers = forms.powers(forms.Span(covariate, np.sort(values)), covariate)
+            tests += [(covariate, powers[:degree]) for degree in (2, 3)]
+    if model.sensor == "accelerometer":
+        tests.append(("specific_force", FORCE))
+    curves = []
+    for covariate, formulas in tests:
+        terms = {f"c{k}": {"formula": text, "unit": "1"} for k, text in enumerate(formulas)}
+        effect = {"name": f"curves_of_{covariate}", "owner": "recording", "sensors": [model.sensor], "terms": terms}
+        definition = effect_from({**effect, "meaning": "Curves."}, "a test of the residual")
+        curves.append(EffectColumns(definition, np.zeros(3 * len(formulas))))
+    equations = model.equations(selection.fits[-1].state, curves)
+    possible = selection.ceilings > selection.fits[-1].log_likelihood - CEILING_TO
+    projected = project_out(equations, [selection.hypotheses[i] for i in np.flatnonzero(possible)])
+    before, setting = projected.of_model()
+    results = []
+    for j, (covariate, _) in enumerate(tests):
+        count = projected.count(j, setting)
+        factor = projected.correction(j, setting, count, equations.scatter) if count else 0.0
+        gain = factor * max(2.0 * (float(projected.with_candidate(j).max()) - before), 0.0)
+        delta, p = gain - count * float(np.log(len(equations.residual))), scipy.special.chdtrc(max(count, 1), gain)
+        results.append((covariate, delta, float(p)))
+    return [Dependence(name, p) for name, (_, p) in significant(results).items()]
+
+
+def _suspects(selection: SelectionByHand, hidden: Mapping[str, str]) -> list[str]:
+    """Return the effects that are not observable, but could be a cause of the residual, the likeliest first.
+
+    The effect shows in the equations, and at its limits explains at least the share ``WORTH`` of the residual's mean
+    square; or it depends on the temperature, which was not recorded or did not change enough.
+    """
+    first, n = selection.first, len(selection.fits[0].residual)
+
+    def possible(name: str) -> bool:
+        if "temperature" in catalogue()[name].needs:
+            return bool(np.isnan(selection.model.rests.temperature).any()) or name in first.scores
+        return name in first.scores and first.visible[name] >= first.spare[name] * n * float(np.log1p(WORTH))
+
+    def unlikely(name: str) -> float:
+        return -first.scores[name].delta_bic if name in first.scores else float("inf")
+
+    return sorted((name for name in hidden if possible(name)), key=unlikely)
+
+
+def _of_scatter(suspects: Sequence[str], over_noise: float) -> str:
+    """Return what to record if the rests scatter more than the noise and no observable effect explains it."""
+    scatter = f"the rests scatter {over_noise:.2g} times the noise"
+    if not suspects:
+        return f"set the unit down firmly for each rest: {scatter} and follow nothing that is recorded"
+    names = listed([plain(name) for name in suspects[:MAX_NAMED_EFFECTS]], "or")
+    warm = any("temperature" in catalogue()[name].needs for name in suspects)
+    temperature = ", with the temperature of the sensor" if warm else ""
+    return f"{MORE_RESTS}{temperature}: {scatter}, and they cannot distinguish an unsteady hand from {names}"

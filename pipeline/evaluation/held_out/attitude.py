@@ -1,0 +1,253 @@
+"""Errors of an attitude that is integrated from the readings of held-out motion, before and after calibration.
+
+The attitude q by the gyroscope alone starts at the table's attitude. Over one interval it turns by the rotation vector
+a[n], with rates w in rad/s that are interpolated by a cubic (Magnus expansion: A. Iserles et al., Lie-group methods,
+Acta Numerica 9, 2000):
+
+    q[n+1] = q[n] exp(a[n] / 2)
+    a[n] = dt (13 w[n] + 13 w[n+1] - w[n-1] - w[n+2]) / 24 + dt^2 (w[n] x w[n+1]) / 12
+
+The drift is the angle between integrated and logged rotation over one minute, root mean square over many starts. The
+tilt is the angle between the verticals of the logged attitude and of one that is fused with the accelerometer
+(complementary filter of ``imufusion``; S. Madgwick, PhD thesis, Bristol 2014, chapter 7). By hand, each held-out move
+is integrated from the rest before it to the rest after it: the error is the angle between the turned direction of
+gravity and the observed one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.core.errors import InputError
+from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.multi_position.faces_and_turns import turns_of
+from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
+from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.multi_position.moves import moves_of, observed_rests
+from pipeline.estimation.rest_means import HELD_OUT, ROLE, is_multi_position
+from pipeline.estimation.uncertainty_budget import covariance_without_reference
+from pipeline.physics.compensation import Compensation
+from pipeline.physics.effects import effect
+from pipeline.core.records import MATRIX, Integers, Noise, Recording, SensorCalibration, Values, continuous, level_in_body
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.core.settings import Procedure
+
+
+DRIFT_TIME_S = 60.0  # s over which a drift is stated
+DRIFT_STARTS = 60  # starts over which a drift is averaged
+SHORTEST_DRIFT_S = 10.0  # s: a drift over a shorter time is mostly noise
+CURVE_POINTS = 120  # points of the published curves
+# largest steps of the complementary filter, which integrates to first order
+MAX_FILTER_STEP_S, MAX_FILTER_STEP_DEG = 0.1, 5.0
+FILTER_GAIN = 0.5  # of the complementary filter: its library's default
+TILT_SETTLING_S = 10.0  # s after which the tilt counts
+
+
+def attitude(
+    accelerometer: SensorCalibration | None, gyroscope: SensorCalibration | None, recordings: Sequence[Recording]
+) -> dict[str, Any]:
+    """Return the part ``attitude`` of ``validations/<unit>.json``, from the first held-out recording of an attitude.
+
+    It has ``reason`` (why there is none, else None), ``recording``, ``seconds`` (60, or the recording's length),
+    ``drift_deg`` and ``tilt_rms_deg`` (each ``before`` and ``after``) and ``curve``: ``time_s`` and, deg, the error of
+    the gyroscope alone (``drift_before``, ``drift_after``) and the tilt of the fused attitude (``tilt_...``).
+    """
+    recording = next((r for r in recordings if r.role == "validation" and r.table_attitude is not None), None)
+    if recording is None:
+        return {"reason": "no held-out recording logs the table's attitude"}
+    if recording.gyroscope is None or gyroscope is None:
+        return {"reason": "the gyroscope is not calibrated"}
+    known, logged = _with_reference(recording)
+    if known.samples < 2 or known.time[-1] - known.time[0] < SHORTEST_DRIFT_S:
+        return {"reason": f"recording {recording.name} is shorter than {SHORTEST_DRIFT_S:g} s"}
+    try:
+        compensated = Compensation(accelerometer, gyroscope).apply(
+            known.accelerometer, known.gyroscope, known.temperature, known.time
+        )
+    except InputError as error:
+        return {"reason": str(error)}
+    reference = (logged / np.linalg.norm(logged, axis=1, keepdims=True)).T
+    time = known.time * known.table_seconds  # by the clock of the reference
+    shown = np.unique(np.linspace(0, known.samples - 1, CURVE_POINTS).astype(int))
+    seconds, curve = float(min(DRIFT_TIME_S, time[-1] - time[0])), {"time_s": _rounded(time[shown] - time[0])}
+    drifts: dict[str, float] = {}
+    tilts: dict[str, float] | None = {} if accelerometer and known.accelerometer is not None else None
+    for name, readings in (("before", known), ("after", compensated)):
+        force, rate = readings.accelerometer, readings.gyroscope
+        assert rate is not None  # noqa: S101
+        alone = integrate(time, rate, reference[:, 0])
+        drifts[name] = drift(time, alone, reference, seconds)
+        curve[f"drift_{name}"] = _rounded(angle_between(alone, reference)[shown])
+        if tilts is not None:
+            assert force is not None  # noqa: S101
+            steps, fused = _fuse(time, force, alone)
+            up, true_up = level_in_body(fused), level_in_body(reference[:, steps].T)
+            sine, cosine = np.linalg.norm(np.cross(up, true_up), axis=1), np.einsum("ij,ij->i", up, true_up)
+            tilt, since = np.degrees(np.arctan2(sine, cosine)), time[steps] - time[0]
+            tilts[name] = float(np.sqrt(np.mean(tilt[since >= min(TILT_SETTLING_S, 0.5 * since[-1])] ** 2)))
+            curve[f"tilt_{name}"] = _rounded(np.interp(time[shown] - time[0], since, tilt))
+    found = {"reason": None, "recording": recording.name, "seconds": seconds}
+    return found | {"drift_deg": drifts, "tilt_rms_deg": tilts, "curve": curve}
+
+
+def integrate(time: Values, rate: Values, start: Values) -> Values:
+    """Return the attitude by integration of angular rates, deg/s, from ``start`` on: unit quaternions (4, n)."""
+    w, dt = np.radians(rate), np.diff(time)[:, None]
+    mean = 0.5 * (w[:-1] + w[1:])
+    mean[1:-1] += (w[1:-2] + w[2:-1] - w[:-3] - w[3:]) / 24.0
+    turns = (dt * mean + dt**2 / 12.0 * np.cross(w[:-1], w[1:])).T
+    half = 0.5 * np.linalg.norm(turns, axis=0)
+    total, step = np.vstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * turns]), 1
+    total = np.column_stack([start, total])
+    while step < len(time):  # products of 2, 4, 8 ... neighbours: a running product in log2 n passes
+        total = np.hstack([total[:, :step], _product(total[:, :-step], total[:, step:])])
+        step *= 2
+    return total
+
+
+def _product(p: Values, q: Values) -> Values:
+    """Return the products of quaternions, (4, n) arrays; four times as fast as scipy's ``Rotation``."""
+    a, b, c, d = p
+    e, f, g, h = q
+    rows = a * e - b * f - c * g - d * h, a * f + b * e + c * h - d * g, a * g - b * h + c * e + d * f
+    return np.stack([*rows, a * h + b * g - c * f + d * e])
+
+
+def drift(time: Values, estimate: Values, reference: Values, seconds: float) -> float:
+    """Return the error of an attitude (4, n) after a time of ``seconds``, root mean square over starts, deg."""
+    last = int(np.searchsorted(time, time[-1] - seconds + 1e-6, "right")) - 1
+    start = np.unique(np.linspace(0, max(last, 0), DRIFT_STARTS).astype(int))
+    interval = float(np.median(np.diff(time)))
+    stop = np.minimum(np.searchsorted(time, time[start] + seconds - 0.5 * interval), len(time) - 1)
+    turned, known = (_between(q[:, start], q[:, stop]) for q in (estimate, reference))
+    return float(np.sqrt(np.mean(angle_between(turned, known) ** 2)))
+
+
+def angle_between(p: Values, q: Values) -> Values:
+    """Return the angle of the rotation from one attitude (4, n) to another: (n,) array, deg."""
+    turned = _between(p, q)
+    return np.asarray(np.degrees(2.0 * np.arctan2(np.linalg.norm(turned[1:], axis=0), np.abs(turned[0]))))
+
+
+def _between(p: Values, q: Values) -> Values:
+    """Return the rotations from attitudes p to attitudes q: (4, n) arrays."""
+    return _product(p * [[1.0], [-1.0], [-1.0], [-1.0]], q)
+
+
+def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]:
+    """Return indices of samples about 0.1 s or 5 deg apart, and the attitude of the complementary filter there.
+
+    The rates are those of the attitude ``alone`` of the gyroscope between these samples. The filter starts at its first
+    attitude.
+    """
+    import imufusion  # noqa: PLC0415  (only units with a logged attitude need it)
+
+    turns = angle_between(alone[:, :-1], alone[:, 1:])
+    within = min(
+        MAX_FILTER_STEP_S / float(np.median(np.diff(time))), MAX_FILTER_STEP_DEG / max(float(turns.max()), 1e-9)
+    )
+    chosen = np.arange(0, len(time), max(1, int(within)))
+    intervals = np.diff(time[chosen])
+    w, *v = _between(alone[:, chosen[:-1]], alone[:, chosen[1:]])
+    sine = np.maximum(np.linalg.norm(v, axis=0), np.finfo(float).tiny)
+    angles = np.degrees(2.0 * np.arctan2(np.copysign(sine, w), np.abs(w)))
+    rates = (angles / sine * v / intervals).T
+    settings = imufusion.AhrsSettings(
+        sample_rate=float(1.0 / np.median(intervals)),
+        convention=imufusion.CONVENTION_NWU,
+        gain=FILTER_GAIN,
+        gyroscope_range=0.0,
+        acceleration_rejection=0.0,
+        magnetic_rejection=0.0,
+        rejection_timeout=0.0,
+    )
+    q = np.empty((len(chosen), 4))
+    q[0] = alone[:, 0]
+    fusion = imufusion.Ahrs().set_settings(settings).skip_startup().set_quaternion(q[0])
+    # The filter compares the force with the attitude before its step.
+    for n, (interval, rate, reading) in enumerate(zip(intervals.tolist(), rates, force[chosen[:-1]], strict=True), 1):
+        fusion.set_sample_period(interval)
+        fusion.update_no_magnetometer(rate, reading)
+        q[n] = fusion.get_quaternion()
+    return chosen, q
+
+
+def _with_reference(recording: Recording) -> tuple[Recording, Values]:
+    """Return the samples of known readings and attitude, and the attitude (n, 4) one delay of the filter earlier."""
+    q = recording.table_attitude
+    assert q is not None  # noqa: S101
+    readings = [v for v in (recording.accelerometer, recording.gyroscope) if v is not None]
+    known, logged = np.isfinite(np.hstack(readings)).all(axis=1), np.isfinite(q).all(axis=1)
+    clock, q = recording.time[logged], q[logged]
+    late = recording.time - float(recording.filter.get("delay_s", 0.0))
+    known &= (late >= clock[:1].sum()) & bool(len(clock))
+    if not known.any():
+        return recording.select(known), np.zeros((0, 4))
+    return recording.select(known), np.stack([np.interp(late[known], clock, c) for c in continuous(q).T], 1)
+
+
+def _rounded(values: Values) -> list[float]:
+    return [float(f"{v:.4g}") for v in values]
+
+
+def gravity_direction(
+    accelerometer: SensorCalibration | None,
+    gyroscope: SensorCalibration | None,
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    procedure: Procedure,
+) -> dict[str, Any]:
+    """Return the part ``gravity_direction`` of ``validations/<unit>.json``, with the noise of the gyroscope.
+
+    It has ``reason`` (why there is none, else None), ``moves`` (number), ``mean_deg``, ``rms_deg`` and ``max_deg``
+    (each ``before`` and ``after`` the gyroscope's calibration), ``noise_floor_deg`` (the mean by white noise alone),
+    ``largest_expected_rms_deg`` (by noise and uncertainties, exceeded with a probability of 0.5 %; where the fit
+    determines the matrix) and ``creeping_rests`` (number of rests in which the unit turned slowly). Where the procedure
+    states turns, ``turns``: ``recording, time_s, axis, stated_deg`` and ``angle_deg`` (``before`` and ``after``).
+    """
+    if not is_multi_position("gyroscope", recordings):
+        return {"reason": "not recorded by hand"}
+    if accelerometer is None or gyroscope is None:
+        return {"reason": "both sensors have to be calibrated"}
+    role = HELD_OUT if any(r.role == HELD_OUT for r in recordings) else ROLE
+    observed = observed_rests(recordings, accelerometer, procedure, role)
+    if observed is None:
+        return {"reason": "no rest is held out"}
+    rests, gravity = observed
+    judged = replace(rests, held_out=~rests.held_out)
+    turns = turns_of(recordings, judged, accelerometer, procedure, role if role == HELD_OUT else "")
+    model = GyroscopeModel(judged, moves_of(recordings, judged), gravity, noise, fewest=1, turns=turns)
+    if model.moves is None:
+        return {"reason": "no move is held out"}
+    terms = tuple(EffectColumns(effect(e.name), e.values) for e in gyroscope.effects)
+    states = {
+        "before": State(np.zeros(3), np.eye(3)),
+        "after": State(gyroscope.bias, gyroscope.matrix, terms),
+    }
+    errors = {name: model.direction_errors(state) for name, state in states.items()}
+    found: dict[str, Any] = {"reason": None, "moves": model.moves.count}
+    found["mean_deg"] = {name: float(np.mean(error)) for name, (error, _) in errors.items()}
+    found["rms_deg"] = {name: float(np.sqrt(np.mean(error**2))) for name, (error, _) in errors.items()}
+    found["max_deg"] = {name: float(np.max(error)) for name, (error, _) in errors.items()}
+    found["noise_floor_deg"] = float(np.mean(errors["after"][1]))
+    found["creeping_rests"] = int(np.count_nonzero(gravity.creeping))
+    if gyroscope.parameters.covariance[MATRIX, MATRIX].any():
+        ratio = 0.0 if noise is None else float(np.mean(noise.wander / np.maximum(noise.white, 1e-300)))
+        details = gyroscope.stages[-1].details if gyroscope.stages else {}
+        moves, directions = (float(details.get(f"scatter_of_{each}") or 0.0) for each in ("moves", "directions"))
+        covariance, freedom = covariance_without_reference(gyroscope), gyroscope.parameters.degrees_of_freedom
+        found["largest_expected_rms_deg"] = model.largest_direction_error(
+            states["after"], covariance, freedom, (moves, directions), ratio
+        )
+    if turns:
+        found["turns"] = [
+            {**after, "angle_deg": {"before": before["angle_deg"], "after": after["angle_deg"]}}
+            for before, after in zip(*map(turns.described, states.values()), strict=True)
+        ]
+    return found

@@ -1,0 +1,363 @@
+"""Held-out errors: the errors of a calibration on samples that no fit used, and the error by noise alone.
+
+The recordings of role ``validation`` are held out; without one, every third rest (``procedure.holdout_every``). Where
+nothing is held out, the samples of the fit are used, and the result says so. With the truth t, the matrix M, and the
+noise n of a sample with its diagonal covariance V (``Samples.variance``: white noise after the filter, bias wander,
+resolution of the encoder, uncertainty of the creep at rest; not the uncertainty of the calibration or the table),
+
+    noise_floor = sqrt(mean E[(|t + M n| - |t|)^2]),    vector_noise_floor = sqrt(mean tr(M V M^T))
+
+Where no attitude is logged, |t| is the reference's magnitude, and the calibrated reading gives the direction of t.
+
+A calibration is worse than the raw readings where its error is above its expected interval
+(``pipeline.evaluation.held_out.expected_error``) and a t-test confirms it. The test compares the mean squared error of each
+stretch of the recordings with that of the raw readings: B stretches, B - 1 degrees of freedom, and the probability
+``FALSE_REFUSALS``.
+
+A small error of the matrix does not show in the magnitude of a held-out error, because the noise of single samples
+covers it. It shows in calibrated readings v of held-out motion whose reference u is a vector: with the error E of the
+matrix, and noise e,
+
+    v = e + (1 + E) u,    T = E^T C^-1 E,    C = C_held + S C_fit S^T
+
+E is fitted in the same way as a calibration (``pipeline.estimation.reference_least_squares``). C_held is the covariance
+of its nine elements by this fit, C_fit the covariance of the calibration's parameters, and S their effect on E. T / 9
+has Fisher's distribution with 9 degrees of freedom and the effective degrees of freedom of the less certain fit. Errors
+of local gravity and of the time base are the same in calibration and reference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.core.errors import CannotCalibrateError, NotObservableError
+from pipeline.estimation import reference_least_squares
+from pipeline.estimation.accelerometer.nonlinear_least_squares import PARAMETER_NAMES
+from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
+from pipeline.estimation.rest_means import count_of_rests
+from pipeline.estimation.uncertainty_budget import covariance_without_reference
+from pipeline.ingest.quality_flags import STUCK
+from pipeline.physics.effects import bench_priors, effect_of
+from pipeline.physics.effects.base import unit_of
+from pipeline.physics.kinematics import EARTH_RATE_DPS
+from pipeline.core.records import (
+    AXES,
+    MATRIX,
+    Agreement,
+    LimitCheck,
+    OverTemperature,
+    SensorValidation,
+    StepErrors,
+    TemperatureBin,
+    UnitRecordings,
+)
+from pipeline.core.settings import Uncertainty
+from pipeline.physics.signal.rests import Rest
+from pipeline.evaluation.held_out.error_breakdown import (
+    direction_known,
+    error_breakdown,
+    last_error_of_magnitude,
+    last_step,
+    left_out,
+)
+from pipeline.evaluation.held_out.expected_error import LinearizedSamples, expected_rms_error, linearized
+from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, reference_vector, squared_norm_errors
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.core.records import Noise, Recording, SensorCalibration
+    from pipeline.core.settings import SensorLimits, Settings
+
+FALSE_REFUSALS = 1e-3  # probability that a calibration as good as the raw readings is refused
+STRETCHES = 20  # a stretch of a recording of minutes is longer than the correlation time of most wander
+MIN_T_TEST_SAMPLES = 5  # of the t-test
+BIN_DEGC = 5.0  # a bias that follows the temperature by 1 mg/degC (MPU-6050) changes by 5 mg within it
+SWEEP_DEGC = 2 * BIN_DEGC  # fills two bins; a unit that warms up on the bench changes by less
+FEWEST_IN_BIN = 10  # samples of a bin that is shown
+
+
+def validate(
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise,
+    settings: Settings,
+    *,
+    other: SensorCalibration | None = None,
+) -> SensorValidation:
+    """Return the errors of a sensor on held-out motion; see ``HeldOutCase`` for the arguments."""
+    case, sensor = HeldOutCase(calibration, recordings, noise, settings, other), calibration.sensor
+    samples, reason = case.held_out_samples(), None
+    if not samples:
+        reason = _why_not_held_out(case)
+        if count := _fitted_exactly(calibration):
+            reason += (
+                f"; the fit passes through its {count} rests exactly, so that their error does not test it: record more"
+            )
+        elif samples := case.fit_samples():
+            reason += "; judged on the samples of the fit"
+    count = int(sum(s.known.sum() for s in samples))
+    part = SensorValidation(
+        unit_of(sensor), reason is None, reason, count, noise, (StepErrors("raw"), StepErrors("calibrated"))
+    )
+    if count:
+        steps, notes = error_breakdown(calibration, samples)
+        floor, vector_floor = noise_floors(calibration, samples)
+        part = replace(
+            part,
+            noise_floor=floor,
+            vector_noise_floor=vector_floor,
+            reference_rms=float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2))),
+            steps=tuple(steps),
+            over_temperature=_over_temperature(case, samples, held_out=part.held_out),
+        )
+        parts = [linearized(calibration, s) for s in samples if s.known.any()]
+        complete = [p for p in parts if p is not None]
+        if len(complete) == len(parts):
+            expected = _expected(case, samples, complete)
+            part = replace(part, expected_rms_error=expected)
+            notes += [EARTH_LEFT_OUT] if any(s.earth_left_out for s in samples) else []
+            if part.held_out:
+                agreement = _agreement(case, samples, complete)
+                part = replace(part, agreement=agreement, worse_than_raw=_worse_than_raw(case, samples, expected[1]))
+        else:
+            names = left_out(calibration, samples)
+            verb = "is" if len(names) == 1 else "are"
+            notes.append(
+                f"the expected error is not stated, because {', '.join(names)} {verb} left out of the held-out error"
+            )
+        part = replace(part, notes=tuple(notes))
+    return replace(part, limits=_check_limits(calibration, part.steps[-1], settings.limits.of(sensor)))
+
+
+EARTH_LEFT_OUT = (
+    "the held-out recording logs no attitude: Earth's rotation is left out of its reference, and the expected error "
+    f"allows for its {EARTH_RATE_DPS:.2g} deg/s"
+)
+
+
+def _over_temperature(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) -> OverTemperature | None:
+    """Return the errors over temperature, of the fit's samples if the held-out ones (``held_out``) sweep none."""
+    bins, of_fit = residuals_over_temperature(case.calibration, samples), not held_out
+    if bins is None and held_out and _is_swept(case.recordings):
+        bins, of_fit = residuals_over_temperature(case.calibration, case.fit_samples()), True
+    return (
+        OverTemperature("the samples of the fit" if of_fit else "the held-out samples", tuple(bins)) if bins else None
+    )
+
+
+def residuals_over_temperature(
+    calibration: SensorCalibration, samples: Sequence[Samples]
+) -> list[TemperatureBin] | None:
+    """Return the errors of the magnitude after the last step, in bins of the temperature of the sensor.
+
+    The mean of a bin shows the remaining dependence on the temperature. None where the temperature is not recorded, or
+    its range is below ``SWEEP_DEGC``.
+    """
+    temperatures, errors = [np.zeros(0)], [np.zeros(0)]
+    for each in samples:
+        error = last_error_of_magnitude(calibration, each)
+        if error is None or each.temperature is None:
+            return None
+        known = each.known & np.isfinite(error) & np.isfinite(each.temperature)
+        temperatures.append(each.temperature[known])
+        errors.append(error[known])
+    warmth, error = np.concatenate(temperatures), np.concatenate(errors)
+    if len(warmth) == 0 or np.ptp(warmth) < SWEEP_DEGC:
+        return None
+    number = np.floor(warmth / BIN_DEGC)
+    return [
+        TemperatureBin(
+            float(warmth[in_bin].mean()),
+            float(error[in_bin].mean()),
+            float(np.sqrt(np.mean(error[in_bin] ** 2))),
+            int(in_bin.sum()),
+        )
+        for each in np.unique(number)
+        if (in_bin := number == each).sum() >= FEWEST_IN_BIN
+    ]
+
+
+def _is_swept(recordings: Sequence[Recording]) -> bool:
+    """Return whether the temperatures of all recordings together span ``SWEEP_DEGC``."""
+    warmth = np.concatenate([np.zeros(0), *(r.temperature for r in recordings if r.temperature is not None)])
+    warmth = warmth[np.isfinite(warmth)]
+    return len(warmth) > 0 and bool(np.ptp(warmth) >= SWEEP_DEGC)
+
+
+def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> tuple[float, float]:
+    """Return the interval of the last step's rms error; ``parts``: the samples with their derivatives.
+
+    Earth's rotation, where it is left out of a magnitude, changes the rms error by its rate at most.
+    """
+    sensor = case.calibration.sensor
+    fitted = [r for r in case.recordings if r.role in {sensor, "rests"} and r.samples and r.reading(sensor) is not None]
+    fitted_s = sum(float(r.time[-1] - r.time[0]) for r in fitted)
+    low, high = expected_rms_error(case.calibration, parts, case.noise, case.settings, fitted_s)
+    earth = EARTH_RATE_DPS if any(s.earth_left_out for s in samples) else 0.0
+    return max(low - earth, 0.0), high + earth
+
+
+def static_error(case: HeldOutCase) -> tuple[float, tuple[float, float]] | None:
+    """Return the error of the mean of the static recording, and its interval as a held-out rest; None without one.
+
+    The heading is unknown, so Earth's rotation widens the interval of a gyroscope twice: its component in the bias, and
+    its component in the recording are unknown.
+    """
+    static = {r.name: [Rest(0, r.samples)] for r in case.recordings if r.role == "static" and r.samples}
+    judged = last_error(case, [s for s in case.at_rests(static) if s.known.any()])
+    if judged is None:
+        return None
+    error, (low, high) = judged
+    turning = 2.0 * EARTH_RATE_DPS if case.calibration.sensor == "gyroscope" else 0.0
+    return error, (max(low - turning, 0.0), high + turning)
+
+
+def last_error(case: HeldOutCase, samples: Sequence[Samples]) -> tuple[float, tuple[float, float]] | None:
+    """Return the rms error of samples after the last step and its interval; None without samples or interval."""
+    errors = [last_error_of_magnitude(case.calibration, s) for s in samples]
+    parts = [linearized(case.calibration, s) for s in samples if s.known.any()]
+    complete = [p for p in parts if p is not None]
+    if not complete or len(complete) < len(parts):
+        return None
+    error = np.concatenate([e for e in errors if e is not None])
+    return float(np.sqrt(np.nanmean(error**2))), _expected(case, samples, complete)
+
+
+def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> Agreement | None:
+    """Return how the matrix agrees with held-out motion.
+
+    None where no held-out motion has a vector reference, the method fixes elements of the matrix, a filter was applied,
+    or an effect moves the motion in time. ``held_out``: the samples of the held-out recordings; ``parts``: the same
+    with their derivatives.
+    """
+    calibration, settings = case.calibration, case.settings
+    sensor = calibration.sensor
+    of_method = any(stage.name == reference_least_squares.NAME for stage in calibration.stages)
+    recordings = [r for r in case.recordings if r.role == "validation" and r.reading(sensor) is not None]
+    vectors = all(r.table_attitude is not None and r.filter["name"] == "none" for r in recordings)
+    moved = any(effect_of(fitted).moves for fitted in calibration.effects)
+    if not (of_method and recordings and vectors and calibration.covariance is not None) or moved:
+        return None
+    if len(parts) < len(recordings) or any(samples.resting for samples in held_out):
+        return None
+    calibrated, slopes = [], np.zeros((9, len(calibration.covariance)))
+    for recording, samples, part in zip(recordings, held_out, parts, strict=True):
+        found = last_step(calibration, samples)
+        if found is None or found[2] is None or not direction_known(calibration, samples):
+            return None
+        reading, truth = found[0], found[2]
+        known = samples.known & np.isfinite(np.hstack([reading, truth])).all(axis=1)
+        rows = np.isfinite(truth[samples.representative]).all(axis=1)
+        columns = np.column_stack([np.ones(np.count_nonzero(rows)), truth[samples.representative][rows]])
+        per_parameter = np.einsum("jn,nip->ijp", np.linalg.pinv(columns)[1:], part.derivative[rows])
+        slopes += part.number * per_parameter.reshape(9, -1)
+        flags = np.zeros(len(known), np.uint16) if recording.flags is None else recording.flags
+        values: dict[str, Any] = {"role": sensor, sensor: np.nan_to_num(reading)}
+        calibrated.append(recording.with_readings(flags=np.where(known, flags, flags | STUCK), **values))
+    at_rest = [r for r in case.recordings if r.role == "static"]
+    table = settings.table.replaced(**dict.fromkeys(bench_priors().values()))
+    plain = settings.replaced(table=table, uncertainty=Uncertainty(monte_carlo=0))
+    held_out_and_static = UnitRecordings([*calibrated, *at_rest], {sensor: case.noise})
+    try:
+        fit = reference_least_squares.fit(sensor, held_out_and_static, None, plain)
+    except (CannotCalibrateError, NotObservableError):
+        return None
+    slopes /= sum(part.number for part in parts)
+    error = np.linalg.inv(fit.matrix).ravel() - np.eye(3).ravel()
+    C = covariance_without_reference(fit)[MATRIX, MATRIX]
+    C += slopes @ covariance_without_reference(calibration) @ slopes.T
+    freedom = min(float(np.min(each.parameters.degrees_of_freedom[MATRIX])) for each in (fit, calibration))
+    from scipy.special import fdtrc  # noqa: PLC0415  (only held-out motion with a vector reference needs it)
+
+    p_value = float(fdtrc(9, min(freedom, 1e9), float(error @ np.linalg.solve(C, error)) / 9.0))
+    u = np.sqrt(np.diag(C))
+    worst = int(np.argmax(np.abs(error) / u))
+    return Agreement(p_value, AXES[worst // 3], AXES[worst % 3], float(error[worst]), 2.0 * float(u[worst]))
+
+
+def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
+    """Return the rms error by noise alone, and the vector rms error by noise alone where an attitude is known."""
+    squares = [
+        squared_norm_errors(reference_vector(calibration, s)[s.known], calibration.matrix, s.variance[s.known])
+        for s in samples
+    ]
+    floor = float(np.sqrt(np.mean(np.concatenate(squares))))
+    if not all(direction_known(calibration, s) for s in samples):
+        return floor, None
+    vectors = np.concatenate([s.variance[s.known] @ np.sum(calibration.matrix**2, axis=0) for s in samples])
+    return floor, float(np.sqrt(np.mean(vectors)))
+
+
+def _why_not_held_out(case: HeldOutCase) -> str:
+    """Return why no samples are held out."""
+    reason = f"no held-out recording holds readings of the {case.calibration.sensor} and a reference for them"
+    procedure = case.settings.procedure
+    if procedure.sheet is not None:
+        return reason + f" (column held_out of {procedure.sheet})"
+    if case.by_hand and procedure.turns is not None:
+        return reason + " (with two turns about each axis between rests of 4 s or longer, the second is held out)"
+    count, fewest = count_of_rests(case.recordings), procedure.holdout_from
+    if count < fewest and all(r.role != "validation" for r in case.recordings):
+        every = procedure.holdout_every
+        return reason + f" ({count} rests all go to the fit; of {fewest} and more, one of {every} is held out)"
+    return reason
+
+
+def _fitted_exactly(calibration: SensorCalibration) -> int:
+    """Return the number of rests by hand if the fit has a parameter for each, and so no residual; 0 otherwise."""
+    for details in (stage.details for stage in calibration.stages if stage.details.get("rests_used")):
+        if details["orientations_used"] + len(details[KNOWN_BY_LIMIT]) <= len(PARAMETER_NAMES):
+            return int(details["orientations_used"])
+    return 0
+
+
+def _worse_than_raw(case: HeldOutCase, samples: Sequence[Samples], allowed: float) -> str | None:
+    """Return why a calibration must not be used, as one sentence; None where it may be used."""
+    errors = [last_error_of_magnitude(case.calibration, s) for s in samples]
+    after = [error[s.known] for error, s in zip(errors, samples, strict=True) if error is not None]
+    if len(after) < len(samples):
+        return None
+    raw = np.concatenate([(np.linalg.norm(s.reading, axis=1) - s.magnitude)[s.known] for s in samples])
+    calibrated = np.concatenate(after)
+    sizes = [float(np.sqrt(np.mean(e**2))) for e in (raw, calibrated)]
+    if sizes[1] <= max(sizes[0], allowed) or len(raw) < MIN_T_TEST_SAMPLES:
+        return None
+    pieces = np.array_split(calibrated**2 - raw**2, min(STRETCHES, len(raw)))
+    means = np.array([piece.mean() for piece in pieces])
+    from scipy.special import stdtrit  # noqa: PLC0415  (only where the calibration seems to be worse)
+
+    limit = stdtrit(len(means) - 1, 1.0 - FALSE_REFUSALS) * float(means.std(ddof=1))
+    if means.mean() * np.sqrt(len(means)) <= limit:
+        return None
+    unit, on_table = unit_of(case.calibration.sensor), case.settings.table.motion != "none"
+    return (
+        f"the calibration makes held-out motion worse: {sizes[0]:.3g} {unit} rms before it, {sizes[1]:.3g} {unit} "
+        f"after, where noise and stated uncertainties explain at most {allowed:.3g} {unit}. Check that fit and "
+        f"held-out recordings are of this unit in the same mounting{', and what the table logged' * on_table}"
+    )
+
+
+def _check_limits(calibration: SensorCalibration, last: StepErrors, limits: SensorLimits) -> tuple[LimitCheck, ...]:
+    """Return each limit with its figure.
+
+    A limit that is null is not checked; a figure that is not known does not pass.
+    """
+    extremes = [abs(v) for v in (last.max_error, last.min_error) if v is not None]
+    figures = {
+        "held_out_rms_error": last.rms_error,
+        "held_out_mean_abs_error": last.mean_abs_error,
+        "held_out_max_abs_error": max(extremes, default=None),
+        "bias": float(np.max(np.abs(calibration.bias))),
+        "scale_factor": float(np.max(np.abs(np.diag(calibration.matrix) - 1.0))),
+    }
+    checks = []
+    for name, value in figures.items():
+        limit: float | None = getattr(limits, name)
+        if limit is not None:
+            passes = value is not None and bool(value <= limit)
+            checks.append(LimitCheck(name, limit, value, passes))
+    return tuple(checks)

@@ -1,0 +1,165 @@
+"""Write and read recordings as Parquet, by pyarrow.
+
+One file for each unit, with its recordings one after the other. ``time_ns`` is int64, ``flags`` uint16, every channel a
+double, null in the rows of recordings without it. The file is a member of a pack, which has a checksum
+(``pipeline.core.pack``). The same recordings give the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import parquet
+
+from imu_logs.text_write import to_arrow, to_numpy
+from imu_logs.units import ACCELEROMETER, ATTITUDE, CHANNELS, GYROSCOPE
+from pipeline.core.errors import InputError
+from pipeline.core.records import Note, Recording
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+
+BLOCKS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE, "table_attitude": ATTITUDE}
+SINGLES = ("temperature", "table_angle", "table_rate", "flags")
+PARQUET_VERSION = 4
+ROW_GROUP = 1_000_000  # samples
+METADATA_KEY = b"recordings"
+COPIED_FIELDS = (
+    "name",
+    "role",
+    "axis",
+    "setup",
+    "kind",
+    "up",
+    "sense",
+    "source",
+    "filter",
+    "clock_shared",
+)  # fields stored as JSON
+TYPES = {"time_ns": "int64", **dict.fromkeys(CHANNELS, "float64"), "flags": "uint16"}
+PAGE_ENCODINGS = {"int64": "DELTA_BINARY_PACKED", "float64": "PLAIN", "uint16": "PLAIN"}
+
+
+def columns_of(recording: Recording) -> dict[str, NDArray[Any]]:
+    """Return the times, channels and flags of a recording, by name."""
+    columns: dict[str, NDArray[Any]] = {"time_ns": recording.time_ns}
+    for name, channels in BLOCKS.items():
+        block = getattr(recording, name)
+        if block is not None:
+            columns |= {c: np.ascontiguousarray(block[:, i]) for i, c in enumerate(channels)}
+    return columns | {n: getattr(recording, n) for n in SINGLES if getattr(recording, n) is not None}
+
+
+def to_parquet(recordings: Sequence[Recording]) -> bytes:
+    """Return the recordings of a unit as a Parquet file."""
+    stored = [columns_of(r) for r in recordings]
+    names = [n for n in TYPES if n == "time_ns" or any(n in columns for columns in stored)]
+    entries = [
+        {
+            **{name: getattr(r, name) for name in COPIED_FIELDS},
+            "rows": r.samples,
+            "columns": list(columns),
+            "notes": [n.to_json() for n in r.notes],
+        }
+        for r, columns in zip(recordings, stored, strict=True)
+    ]
+    description = {"schema_version": PARQUET_VERSION, "recordings": entries}
+    text = json.dumps(description, separators=(",", ":"), default=_plain)
+    schema = pa.schema([(n, pa.type_for_alias(TYPES[n])) for n in names], metadata={METADATA_KEY: text.encode()})
+    tables = [
+        pa.Table.from_arrays(
+            [
+                to_arrow(np.ascontiguousarray(columns[n], TYPES[n])) if n in columns else pa.nulls(r.samples, kind)
+                for n, kind in zip(names, schema.types, strict=True)
+            ],
+            schema=schema,
+        )
+        for r, columns in zip(recordings, stored, strict=True)
+    ]
+    sink = pa.BufferOutputStream()
+    parquet.write_table(
+        pa.concat_tables(tables) if tables else schema.empty_table(),
+        sink,
+        row_group_size=ROW_GROUP,
+        compression="lz4",
+        use_dictionary=False,
+        column_encoding={n: PAGE_ENCODINGS[TYPES[n]] for n in names},
+        write_statistics=False,
+    )
+    return sink.getvalue().to_pybytes()  # type: ignore[no-any-return]
+
+
+def from_parquet(content: bytes, name: str) -> list[Recording]:
+    """Return the recordings of a unit, identical to the saved ones; ``name``: of the file, for errors.
+
+    The times are read at once, every other channel when it is first used: a stage decodes only the channels it uses.
+    """
+    # a file of some MB is read fastest by a single thread
+    file = parquet.ParquetFile(pa.BufferReader(content), pre_buffer=False)
+    text = (file.schema_arrow.metadata or {}).get(METADATA_KEY)
+    if text is None:
+        raise InputError("holds no recordings: it was not written by ingest or filter", name)
+    description = json.loads(text)
+    if description["schema_version"] != PARQUET_VERSION:
+        raise InputError(
+            f"schema_version {description['schema_version']} is not known to this version ({PARQUET_VERSION}); "
+            "delete the results and run again",
+            name,
+        )
+    decoded: dict[str, Any] = {}
+
+    def read(start: int, rows: int, names: Sequence[str]) -> list[NDArray[Any]]:
+        new = [n for n in names if n not in decoded]
+        if new:
+            table = file.read(new, use_threads=False)
+            decoded.update({n: c if c.null_count else to_numpy(c) for n, c in zip(new, table.columns, strict=True)})
+        columns = [decoded[n] for n in names]
+        rest = slice(start, start + rows)
+        return [c[rest] if isinstance(c, np.ndarray) else to_numpy(c.slice(start, rows)) for c in columns]
+
+    recordings: list[Recording] = []
+    start = 0
+    for entry in description["recordings"]:
+        recordings.append(_StoredRecording.of(entry, partial(read, start, entry["rows"])))
+        start += entry["rows"]
+    return recordings
+
+
+class _StoredRecording(Recording):
+    """A recording whose channels, below, are decoded when they are first used."""
+
+    @classmethod
+    def of(cls, entry: dict[str, Any], read: Callable[[Sequence[str]], list[NDArray[Any]]]) -> Recording:
+        """Return the recording of an entry of the file's description; ``read`` returns its columns."""
+        recording = cls.__new__(cls)
+        vars(recording).update(
+            {n: entry[n] for n in COPIED_FIELDS},
+            time_ns=read(["time_ns"])[0],
+            notes=tuple(map(Note.of, entry["notes"])),
+            stored=lambda names: read(names) if names[0] in entry["columns"] else None,
+        )
+        return recording
+
+    def channels(self, names: Sequence[str]) -> NDArray[Any] | None:
+        """Return a channel, or a block of three or four; None if the file does not have it."""
+        columns = vars(self)["stored"](names)
+        return None if columns is None else columns[0] if len(names) == 1 else np.column_stack(columns)
+
+
+for _name, _channels in {**BLOCKS, **{name: (name,) for name in SINGLES}}.items():
+    _property = cached_property(partial(_StoredRecording.channels, names=_channels))
+    _property.__set_name__(_StoredRecording, _name)
+    setattr(_StoredRecording, _name, _property)
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be stored in a recording's metadata")

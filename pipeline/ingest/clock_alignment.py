@@ -1,0 +1,305 @@
+"""Align the clock of a table's log with the sensor's clock, by the motion in both logs.
+
+    tau  = t + d + k (t - t_m)
+    w(t) = A r(tau) + a + noise,   f(t) = B u(tau) + b + noise
+
+with the sensor's and the table's clock t and tau, s; offset d and drift k of the table's clock, uncorrelated at t_m;
+readings w and f; and the signals r and u of the table's log to which they respond (``pipeline.ingest.encoder_log``).
+
+``d`` is first found by correlation on a grid. The steps of a table repeat, but the directions of gravity at the steps
+do not: of the offsets with similar correlation, the one with the smallest residual of the whole model is selected. The
+table is assumed at rest before and after its log. If no offset fits with this assumption, only the times that both logs
+cover are compared. Then d and k are refined by Gauss-Newton, with A, B, a, b eliminated by projection.
+
+The residuals are not white: they are largest where the rate changes, and there the offset is determined. So the
+covariance is a sandwich estimate from the scatter between blocks,
+
+    C = H^-1 (sum_b s_b s_b') H^-1,   H = J'J,   s_b = J_b' e_b
+
+with the projected derivatives J and the residuals e, enlarged for the effective number of blocks. It is computed with
+blocks of 1 s and of 4 s. The uncertainty is the largest of both and that of white noise, combined with the error of the
+interpolation, 0.5 % of the table's interval.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from imu_logs.log import Note
+from imu_logs.units import TABLE_TIME, TRIADS
+from pipeline.core.errors import IngestError
+from pipeline.ingest.encoder_log import Signals, interpolators, seconds_of, signals_of, unwrapped
+
+if TYPE_CHECKING:
+    from imu_logs.log import Log
+    from pipeline.core.records import Mask, Values
+
+
+MIN_SPLINE_ROWS = 6  # for the quintic spline
+SMALLEST_CORRELATION = 0.9  # at most 19 % of the variance of the rates is not explained, 1 - 0.9^2
+BLOCKS_S = (1.0, 4.0)  # about the length of a ramp of the rate, and longer
+COARSE_S = 0.01  # step of the grid of offsets
+MOST_PLACES, WORTH_A_LOOK = 40, 0.3  # offsets refined, and their least correlation relative to the best
+SAMPLES_OF_A_LOOK = 20_000  # bounds the cost of up to 40 offsets
+AMBIGUOUS = 1.1  # ratio of the second-best mean squared residual to the best
+MIN_SHARED_DURATION = 0.5  # share of the shorter log that both must cover
+MAX_CLOCK_STEPS, ROUNDING_S = 20, 1e-9  # Gauss-Newton stops below 1 ns, the resolution of the times
+MIN_CLOCK_BLOCKS = 3.0  # bounds the factor nu / (nu - 2), the variance of Student's t, for few blocks
+RESOLVED = 0.005  # of the table's interval: between its samples the motion is interpolated
+
+
+@dataclass(frozen=True)
+class ClockFit:
+    """Offset (s) and drift (1) of the table's clock with standard uncertainties, and the correlation of the motions.
+
+    ``middle`` is t_m; both times count from the first sample of each log.
+    """
+
+    offset: float
+    drift: float
+    offset_uncertainty: float
+    drift_uncertainty: float
+    middle: float
+    correlation: float
+
+    def table_time(self, t: Values) -> Values:
+        """Convert times of the sensor to the table's time, s."""
+        return np.asarray(t + self.offset + self.drift * (t - self.middle))
+
+
+@dataclass(frozen=True)
+class SensorSignals:
+    """Times (s), readings (n, 3 or 6), the number of rates among them, and the noise of each."""
+
+    time: Values
+    readings: Values
+    rates: int
+    noise: Values
+
+    def part(self, rows: slice | Mask) -> SensorSignals:
+        """Return some of the samples."""
+        return SensorSignals(self.time[rows], self.readings[rows], self.rates, self.noise)
+
+
+def fit_clocks(sensor: Log, log: Log) -> ClockFit:
+    """Return offset and drift of the table's clock; the times count from the first sample of each log.
+
+    Raises ``IngestError`` for a sensor without gyroscope, and for logs that do not show the same motion, or that fit
+    equally well at several offsets.
+    """
+    if "gyro_x" not in sensor.values:
+        raise IngestError("a table's log with its own clock needs a gyroscope to be aligned", log.path, code="no_sync")
+    signals = signals_of(log)
+    sensed = _sensor_signals(sensor, signals)
+    look = sensed.part(slice(None, None, max(1, len(sensed.time) // SAMPLES_OF_A_LOOK)))
+    places = _places(look, signals)
+    for resting in (True, False):
+        residuals = np.array([_left(look, signals, place, beyond=resting) for place in places])
+        order = np.argsort(residuals)
+        best = places[int(order[0])]
+        fit = _refine(sensed if resting else sensed.part(signals.covers(sensed.time + best)), signals, best)
+        if fit.correlation > SMALLEST_CORRELATION:
+            break
+    if not fit.correlation > SMALLEST_CORRELATION:
+        message = (
+            "the table's log does not show the motion that the gyroscope read "
+            f"(correlation {fit.correlation:.2f} at best)"
+        )
+        hint = "do both logs belong to one recording, and are their units right?"
+        raise IngestError(message, log.path, code="no_sync", hint=hint)
+    if len(order) > 1 and residuals[order[1]] < AMBIGUOUS * residuals[order[0]]:
+        message = (
+            f"the motion repeats itself: the offsets {best:.3f} and {places[int(order[1])]:.3f} s fit equally well"
+        )
+        hint = "log the table during the whole recording, or begin and end it with a turn unlike the others"
+        raise IngestError(message, log.path, code="no_sync", hint=hint)
+    return fit
+
+
+def _sensor_signals(sensor: Log, signals: Signals) -> SensorSignals:
+    rates = np.column_stack([sensor.values[c] for c in TRIADS["gyroscope"]])
+    if signals.magnitude:
+        rates = np.linalg.norm(rates - np.median(rates, axis=0), axis=1)[:, None]
+    forces = np.zeros((len(rates), 0))
+    if signals.directions.shape[1] and "accel_x" in sensor.values:
+        forces = np.column_stack([sensor.values[c] for c in TRIADS["accelerometer"]])
+    readings = np.column_stack([rates, forces])
+    noise = np.maximum(np.median(np.abs(np.diff(readings, axis=0)), axis=0), 1e-3 * np.std(readings, axis=0))
+    m = rates.shape[1]
+    noise[:m], noise[m:] = noise[:m].max(initial=0.0), noise[m:].max(initial=0.0)
+    return SensorSignals(seconds_of(sensor), readings, m, np.maximum(noise, 1e-12))
+
+
+def _places(sensed: SensorSignals, signals: Signals) -> list[float]:
+    """Return the offsets with the highest correlation of the rates, s."""
+    stride = max(1, round(COARSE_S / signals.step))
+    step, rates = stride * signals.step, signals.rates[::stride]
+    grid = step * np.arange(int(sensed.time[-1] / step) + 1)
+    size = len(grid) + len(rates)
+    size = 1 << (size - 1).bit_length()
+    score = np.zeros(size)
+    for r in rates.T:
+        transformed = np.fft.rfft(r - r.mean(), size)
+        for w in sensed.readings[:, : sensed.rates].T:
+            one = np.interp(grid, sensed.time, w)
+            score += np.fft.irfft(transformed * np.conj(np.fft.rfft(one - one.mean(), size)), size) ** 2
+    peaks = np.flatnonzero((score >= np.roll(score, 1)) & (score > np.roll(score, -1)))
+    peaks = peaks[score[peaks] > WORTH_A_LOOK**2 * score.max()]
+    best = peaks[np.argsort(-score[peaks])][:MOST_PLACES]
+    lags = np.where(best < len(rates), best, best - size)
+    return [float(lag) * step for lag in lags] or [0.0]
+
+
+def _left(sensed: SensorSignals, signals: Signals, offset: float, *, beyond: bool) -> float:
+    """Return the mean squared residual of the whole model at an offset, relative to the noise.
+
+    It is infinite where the logs overlap by less than half of the shorter one.
+    """
+    inside = signals.covers(sensed.time + offset)
+    shared = float(np.mean(inside)) * sensed.time[-1]
+    if shared < MIN_SHARED_DURATION * min(sensed.time[-1], signals.duration):
+        return np.inf
+    covered = sensed if beyond else sensed.part(inside)
+    rates, directions, *_ = signals.at(covered.time + offset)
+    total = 0.0
+    for columns, readings, noise in _groups(covered, rates, directions):
+        Q = np.linalg.qr(columns)[0]
+        total += float(np.sum(((readings - Q @ (Q.T @ readings)) / noise) ** 2))
+    return total / len(covered.time)
+
+
+def _groups(sensed: SensorSignals, rates: Values, directions: Values) -> list[tuple[Values, Values, Values]]:
+    """Return columns, readings and noise of the rates and, if there are any, of the forces."""
+    ones = np.ones((len(sensed.time), 1))
+    m = sensed.rates
+    out = [(np.hstack([rates, ones]), sensed.readings[:, :m], sensed.noise[:m])]
+    if sensed.readings.shape[1] > m:
+        out.append((np.hstack([directions, ones]), sensed.readings[:, m:], sensed.noise[m:]))
+    return out
+
+
+def _refine(sensed: SensorSignals, signals: Signals, offset: float) -> ClockFit:
+    d, k, middle = offset, 0.0, float(sensed.time[-1]) / 2
+    for _ in range(MAX_CLOCK_STEPS):
+        J, e, weight, correlation = _linearised(sensed, signals, d + k * (sensed.time - middle), middle)
+        moved = float(np.average(sensed.time, weights=weight)) if weight.sum() > 0 else middle
+        if abs(moved - middle) > 1e-3 * sensed.time[-1]:
+            d, middle = d + k * (moved - middle), moved
+            continue
+        size = np.linalg.norm(J, axis=0)
+        if not np.all(size > 0):
+            return ClockFit(d, k, np.inf, np.inf, middle, 0.0)
+        change = np.linalg.lstsq(J / size, e, rcond=None)[0] / size
+        d, k = d + float(change[0]), k + float(change[1])
+        if abs(change[0]) + abs(change[1]) * sensed.time[-1] < ROUNDING_S:
+            break
+    floor = RESOLVED * signals.interval * np.array([1.0, 1.0 / max(sensed.time[-1], 1e-9)])
+    inverse = np.linalg.lstsq(np.linalg.qr(J, mode="r"), np.eye(2), rcond=None)[0]
+    by_blocks = [_uncertainties_by_blocks(J, e, sensed, inverse @ inverse.T, length) for length in BLOCKS_S]
+    spread = np.max([np.linalg.norm(inverse, axis=1) * np.sqrt(np.mean(e**2)), *by_blocks], axis=0)
+    spread = np.hypot(spread, floor)
+    return ClockFit(d, k, float(spread[0]), float(spread[1]), middle, correlation)
+
+
+def _linearised(
+    sensed: SensorSignals, signals: Signals, shift: Values, middle: float
+) -> tuple[Values, Values, Values, float]:
+    """Return projected derivatives to d and k, residuals (in noise), the weight of each time, and the correlation."""
+    rates, directions, rate_slopes, direction_slopes = signals.at(sensed.time + shift)
+    lever = sensed.time - middle
+    derivatives: list[Values] = []
+    residuals: list[Values] = []
+    weight = np.zeros(len(lever))
+    correlation = 0.0
+    slopes = (rate_slopes, direction_slopes)
+    for (columns, readings, noise), slope in zip(_groups(sensed, rates, directions), slopes, strict=False):
+        Q, R = np.linalg.qr(columns)
+        B = np.linalg.lstsq(R, Q.T @ readings, rcond=None)[0]
+        residual = readings - columns @ B
+        if not residuals:
+            spread = readings - readings.mean(axis=0)
+            explained = 1.0 - float(np.sum(residual**2)) / max(float(np.sum(spread**2)), 1e-300)
+            correlation = float(np.sqrt(max(explained, 0.0)))
+        steep = slope @ B[:-1]
+        weight += np.sum((steep / noise) ** 2, axis=1)
+        for column in range(readings.shape[1]):
+            both = np.column_stack([steep[:, column], steep[:, column] * lever])
+            derivatives.append((both - Q @ (Q.T @ both)) / noise[column])
+            residuals.append(residual[:, column] / noise[column])
+    return np.concatenate(derivatives), np.concatenate(residuals), weight, correlation
+
+
+def _uncertainties_by_blocks(J: Values, e: Values, sensed: SensorSignals, covariance: Values, length: float) -> Values:
+    channels = sensed.readings.shape[1]
+    starts = np.flatnonzero(np.diff(np.floor(sensed.time / length), prepend=-1.0))
+    scores = np.add.reduceat((J * e[:, None]).reshape(channels, len(sensed.time), 2).sum(axis=0), starts)
+    information = np.add.reduceat((J**2).reshape(channels, len(sensed.time), 2).sum(axis=0), starts)
+    spread = np.linalg.norm(covariance @ scores.T, axis=1)
+    blocks = information.sum(axis=0) ** 2 / np.sum(information**2, axis=0)
+    return np.asarray(spread * np.sqrt(blocks / np.maximum(blocks - 2.0, 1.0 / MIN_CLOCK_BLOCKS)))
+
+
+def align(sensor: Log, log: Log) -> Log:
+    """Add the channels of a table's log, interpolated at the sensor's times; refuse logs of different motions.
+
+    Rows that the table's log does not cover are dropped. If the table rests throughout, no result depends on the
+    alignment, and both logs are assumed to begin together.
+    """
+    log = unwrapped(log)
+    t, log_time = seconds_of(sensor), seconds_of(log)
+    if len(log_time) < MIN_SPLINE_ROWS:
+        message = f"the table's log has {len(log_time)} rows; at least {MIN_SPLINE_ROWS} are needed"
+        raise IngestError(message, log.path, code="no_sync")
+    if signals_of(log).resting:
+        tau = np.clip(t, 0.0, log_time[-1])
+        note = Note("N-SYNC", len(t), 0, 0, "the table rests throughout its log: there is no motion to align by")
+        return _merged(sensor, log, slice(0, len(t)), tau, {}, [note])
+    fit = fit_clocks(sensor, log)
+    tau = fit.table_time(t)
+    inside = np.flatnonzero((tau >= 0) & (tau <= log_time[-1]))
+    if inside.size < 2:
+        raise IngestError("no time is covered by both logs", log.path, code="no_sync")
+    rows = slice(int(inside[0]), int(inside[-1]) + 1)
+    clock = {
+        "offset_s": float(log.time_ns[0] - sensor.time_ns[0]) / 1e9 + fit.offset,
+        "offset_uncertainty_s": fit.offset_uncertainty,
+        "drift_ppm": fit.drift * 1e6,
+        "drift_uncertainty_ppm": fit.drift_uncertainty * 1e6,
+        "at_s": fit.middle,
+        "correlation": fit.correlation,
+    }
+    return _merged(sensor, log, rows, tau[rows], clock, _notes(sensor, rows, fit, clock["offset_s"]))
+
+
+def _notes(sensor: Log, rows: slice, fit: ClockFit, offset_s: float) -> list[Note]:
+    detail = (
+        f"the table's clock is {offset_s:.7g} s (+- {_one_digit(fit.offset_uncertainty)} s, one standard deviation) "
+        f"ahead of the sensor's {fit.middle:.4g} s after its first sample and gains {fit.drift * 1e6:.3g} ppm "
+        f"(+- {_one_digit(fit.drift_uncertainty * 1e6)}); aligned by the motion in both logs (correlation "
+        f"{fit.correlation:.5f})"
+    )
+    sync = sensor.note("N-SYNC", np.arange(rows.start, rows.stop), detail)
+    lost = len(sensor.time_ns) - sync.count
+    detail = f"{lost} rows that the table's log does not cover were left out"
+    return [sync, *([Note("N-CUT", lost, sync.first, sync.last, detail)] if lost else [])]
+
+
+def _one_digit(value: float) -> str:
+    """Format a number with one significant digit, without exponent."""
+    return np.format_float_positional(float(f"{value:.1g}"), trim="-")
+
+
+def _merged(sensor: Log, log: Log, rows: slice, tau: Values, clock: dict[str, float], notes: list[Note]) -> Log:  # noqa: PLR0917
+    hashes = {entry.get("sha256") for entry in (sensor.source, *sensor.source.get("joined", []))} - {None}
+    same, found = log.source is sensor.source or log.source.get("sha256") in hashes, interpolators(log)
+    part = sensor.select(rows, *(() if same else log.notes), *notes)
+    joined = {} if same else {"joined": [*sensor.source.get("joined", []), log.source]}
+    sensor_channels = {c: v for c, v in part.values.items() if c not in log.values and c != TABLE_TIME}
+    return replace(
+        part,
+        values=sensor_channels | {channel: at(tau) for channel, at in found.items()},
+        source=sensor.source | ({"table_clock": clock} if clock else {}) | joined,
+    )

@@ -1,0 +1,333 @@
+"""Find samples that neither noise nor motion explains: bus glitches, shocks, and disturbed rests.
+
+**Disturbances.** The motion by the log is removed from each channel by least squares: from a specific force a constant
+and gravity in the body (by attitude, or cosine and sine of the angle), from an angular rate a constant and the table's
+rate. A sample is disturbed where the residual x differs from the median m of the samples around it by
+
+    |x - m| > 10 s + 1.5 L
+
+where s is the larger of the noise between neighbours and the scatter about m (at rest, the median scatter of the
+rests), and L is the largest change by a delay, a clock error or a lever arm within half a second: for a gyroscope the
+variation of the table's rate; for an accelerometer g times the angle turned in 0.2 s, and the acceleration at a lever
+arm of 0.1 m. So effects that shift a reading in time are no disturbances. The samples around are the same rest, up to 2
+s on either side, or half a second of motion. Without a table's log, the motion is taken from the gyroscope, and only
+rests are searched; a static recording is searched as a whole.
+
+**Disturbed rests.** A rest by the table's log is cut into pieces of at most 2 s. Its first and last 0.3 s are not used,
+because a sensor with a delay reads the move there. A whole piece is left out where
+
+    chi^2 = sum over its n samples and the 3 axes of (x - m)^2 / s^2 > 4 nu  and  > nu + 6 sqrt(2 nu) + 18
+
+with ``nu = 3 (n - 1)``, m the mean of the piece and s the median scatter of an axis over the pieces of the recording
+(at least half a count), without the most distant sample, which may be a glitch. Rests by hand are tested in
+``pipeline.physics.signal.rests``.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from imu_logs.units import STANDARD_GRAVITY
+from pipeline.ingest.quality_flags import GAP
+from pipeline.core.records import (
+    MEDIAN_SIZE,
+    SENSOR_UNITS,
+    conjugate_product,
+    continuous,
+    level_in_body,
+    median,
+    noise_of_steps,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pipeline.core.records import Index, Note, Recording, Values
+
+
+# 10 and 7 standard deviations: below 3e-12 by chance for normal noise; half of L as a margin.
+MAX_DEVIATIONS, ALLOWED, JUMP = 10.0, 1.5, 7.0
+AROUND_S, FEWEST_AROUND = 0.5, 6  # on either side
+REST_S, MIN_REST_MEDIAN_SAMPLES = 2.0, 40  # where the unit rests, more samples make the median more precise
+LATE_S = 0.1  # a delay of a low-cost filter or of the log
+WINDOWS = 40  # of a recording, to find the usual scatter of its rests
+LEVER_M = 0.1  # of the accelerometer from the turn axis, a usual fixture
+STILL_DEG = 0.05  # turned within a window that is at rest
+STILL_BY_HAND_DEG = 0.5  # integral of a gyroscope's noise and bias
+SAME_EVENT = 5  # samples between two that belong to one event; an event of several is widened by 2
+
+PIECE_S, SETTLING_S = 2.0, 0.3  # as the module's description states
+AT_REST_DPS = 0.02  # assumed noise of the rates of table encoders at rest
+MIN_PIECE_SAMPLES = 4  # samples of a piece
+FEWEST_PIECES = 8  # by which the usual scatter is known
+RATIO = 4.0  # a scatter twice the usual one
+# P(chi^2 > nu + 6 sqrt(2 nu) + 18) < exp(-9) (Laurent and Massart 2000, lemma 1)
+SIGNIFICANT_DEVIATIONS, CHI_SQUARE_TAIL = 6.0, 18.0
+LARGEST_SHARE = 0.1  # of the pieces
+
+
+def leave_out_disturbances(
+    recording: Recording, note: Callable[[str, Index, str], Note], largest_share: float
+) -> Recording:
+    """Remove the disturbed samples of a recording, and note them by ``note``, the method of its ``Log``.
+
+    If they are more than ``largest_share`` of the samples, none is removed, and that is noted: then the disturbance is
+    a property of the bench.
+    """
+    silent = recording.accelerometer is None and recording.gyroscope is None
+    if silent or largest_share == 0 or recording.samples < 4 * FEWEST_AROUND:
+        return recording
+    excess, where = disturbed(recording)
+    excess[~recording.valid] = 0.0  # no fit looks at them
+    rows = np.flatnonzero(np.any(excess > 0, axis=1))
+    if not rows.size:
+        return recording
+    row, column = np.unravel_index(int(np.argmax(excess)), excess.shape)
+    sensor, axis = where[column]
+    events = 1 + int(np.count_nonzero(np.diff(rows) > SAME_EVENT))
+    worst = (
+        f"largest: {sensor} {axis} is {excess[row, column]:.3g} {SENSOR_UNITS[sensor]} beyond what noise and motion "
+        f"allow at {recording.time_ns[row] / 1e9:.9g} s"
+    )
+    places = f"{rows.size} sample{'s' * (rows.size > 1)} in {events} place{'s' * (events > 1)}"
+    if rows.size > largest_share * recording.samples:
+        detail = (
+            f"{places} look like glitches or knocks, more than the share of {largest_share:g} that "
+            f"ingest.checks.disturbed_rows leaves out, so all are kept; does the bench vibrate, "
+            f"or the log run on another clock? {worst}"
+        )
+        return replace(recording, notes=(*recording.notes, note("N-RESTLESS", rows, detail)))
+    detail = f"{places} left out as glitches or knocks; {worst}"
+    return without_rows(recording, rows, note("N-DISTURBED", rows, detail))
+
+
+def without_rows(recording: Recording, rows: Index, note: Note) -> Recording:
+    """Remove samples from a recording, flag a gap before the following sample, and add the note."""
+    undisturbed = np.ones(recording.samples, bool)
+    undisturbed[rows] = False
+    flags = np.zeros(recording.samples, np.uint16) if recording.flags is None else recording.flags.copy()
+    flags[np.minimum(rows + 1, recording.samples - 1)] |= GAP
+    kept = replace(recording, flags=flags).select(undisturbed)
+    return replace(kept, notes=(*kept.notes, note))
+
+
+def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
+    """Return the excess of each reading over its limit, (n, c) array, and sensor and axis of the columns.
+
+    Samples next to an event of several samples are given the smallest positive excess, so that they are removed, too.
+    """
+    found = [(s, r) for s in SENSOR_UNITS if (r := recording.reading(s)) is not None]
+    where = [(s, axis) for s, _ in found for axis in "xyz"]
+    raw = np.concatenate([r for _, r in found], axis=1)
+    excess = np.zeros_like(raw)
+    if not np.isfinite(raw).all():
+        return excess, where
+    step = np.abs(np.diff(raw, axis=0))
+    if not np.any(step > JUMP * _noise(step)):
+        return excess, where
+    motion = _Motion(recording)
+    values = np.concatenate([motion.unexplained(s, r) for s, r in found], axis=1)
+    change = {sensor: motion.change(sensor) for sensor, _ in found}
+    step = np.abs(np.diff(values, axis=0))
+    noise = _noise(step)
+    jump = step - JUMP * noise
+    for column in np.flatnonzero((jump > 0).any(axis=0)):
+        allowed = change[where[column][0]]
+        jumps = np.flatnonzero(jump[:, column] > np.minimum(allowed[:-1], allowed[1:]))
+        usual = motion.scatter_of_rests(values[:, column]) if jumps.size else None
+        for n in np.unique(np.clip(np.concatenate([jumps, jumps + 1]), 0, recording.samples - 1)):  # on either side
+            window, resting = motion.around(n)
+            around = values[window, column]
+            middle = float(median(around))
+            scatter = usual if resting and usual is not None else _scatter(around)
+            scatter = max(float(noise[column]), scatter)
+            off = abs(float(values[n, column]) - middle) - MAX_DEVIATIONS * scatter - ALLOWED * float(allowed[n])
+            excess[n, column] = max(off, 0.0)
+    return _widened(excess), where
+
+
+def _noise(step: Values) -> Values:
+    """Return the noise from the differences of neighbours; one count where most are equal: (c,) array."""
+    noise = noise_of_steps(step)
+    if np.all(noise > 0):
+        return noise
+    return np.where(noise > 0, noise, np.where(step > 0, step, np.inf).min(axis=0))
+
+
+def _scatter(values: Values) -> float:
+    return MEDIAN_SIZE * float(median(np.abs(values - median(values))))
+
+
+def _widened(excess: Values) -> Values:
+    rows = np.flatnonzero(np.any(excess > 0, axis=1))
+    for event in np.split(rows, np.flatnonzero(np.diff(rows) > SAME_EVENT) + 1):
+        if len(event) > 2:
+            inside = slice(max(event[0] - 2, 0), event[-1] + 3)
+            excess[inside] = np.maximum(excess[inside], np.finfo(float).tiny)
+    return excess
+
+
+class _Motion:
+    """The motion in a recording: by the table's log, by hand, or at rest."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        self.half = max(FEWEST_AROUND, int(np.ceil(AROUND_S / recording.interval)))
+        self.long = max(MIN_REST_MEDIAN_SAMPLES, int(np.ceil(REST_S / recording.interval)))
+        rate = self._rate()
+        self.unknown = rate is None
+        by_table = [recording.table_rate, recording.table_angle, recording.table_attitude]
+        self.by_hand = rate is not None and recording.role != "static" and all(log is None for log in by_table)
+        if rate is None:
+            rate = np.zeros((recording.samples, 1))
+        self.rate = rate
+        self.still = STILL_BY_HAND_DEG if self.by_hand else STILL_DEG
+        dt = np.diff(recording.time)
+        turned = 0.5 * np.linalg.norm(rate[1:] + rate[:-1], axis=1) * dt
+        changed = np.linalg.norm(np.diff(rate, axis=0), axis=1)
+        speed = np.radians(np.linalg.norm(rate, axis=1))
+        pulled = (np.radians(changed) / dt + np.abs(np.diff(speed**2))) * LEVER_M / STANDARD_GRAVITY
+        self.turned, self.changed, self.pulled = (
+            np.concatenate([[0.0], np.cumsum(v)]) for v in (turned, changed, pulled)
+        )
+
+    def _rate(self) -> Values | None:
+        """Return the rate: (n, 1) or (n, 3) array, deg/s; None if it is unknown."""
+        r = self.recording
+        if r.table_attitude is not None and np.isfinite(r.table_attitude).all():
+            q = continuous(r.table_attitude)
+            rate = np.degrees(2.0 * conjugate_product(q[:-1], q[1:])) / np.diff(r.time)[:, None]
+            return np.concatenate([rate, rate[-1:]])
+        if r.table_rate is not None:
+            return r.table_rate[:, None]
+        if r.table_angle is not None:
+            rate = np.diff(r.table_angle) / np.diff(r.time)
+            return np.append(rate, rate[-1])[:, None]
+        if r.role == "static":
+            return np.zeros((r.samples, 1))
+        return None if r.gyroscope is None else r.gyroscope - median(r.gyroscope)
+
+    def unexplained(self, sensor: str, reading: Values) -> Values:
+        """Return the residual of a sensor's readings after the fit of the motion by the log: (n, 3) array."""
+        r, columns = self.recording, [np.ones((self.recording.samples, 1))]
+        if sensor == "gyroscope":
+            columns += [] if self.by_hand or self.unknown else [self.rate]
+        elif r.table_attitude is not None and np.isfinite(r.table_attitude).all():
+            columns.append(level_in_body(r.table_attitude))
+        elif r.table_angle is not None:
+            angle = np.radians(r.table_angle)[:, None]
+            columns += [np.cos(angle), np.sin(angle)]
+        A = np.hstack(columns)
+        if A.shape[1] == 1 or not np.isfinite(A).all():
+            return reading
+        return np.asarray(reading - A @ np.linalg.lstsq(A, reading, rcond=None)[0])
+
+    def change(self, sensor: str) -> Values:
+        """Return the largest change of the residual by the motion: (n,) array, infinite if the motion is unknown."""
+        n = np.arange(self.recording.samples)
+        low, high = np.maximum(n - self.half, 0), np.minimum(n + self.half, len(n) - 1)
+        if self.unknown or (self.by_hand and sensor == "gyroscope"):
+            return np.full(len(n), np.inf)
+        if sensor == "gyroscope":
+            return np.asarray(self.changed[high] - self.changed[low])
+        turned = self.turned[high] - self.turned[low]
+        late = max(1, round(LATE_S / self.recording.interval))
+        soon = self.turned[np.minimum(n + late, n[-1])] - self.turned[np.maximum(n - late, 0)]
+        most = np.max([soon[low], soon, soon[high]], axis=0)
+        change = np.radians(np.minimum(most, turned)) + self.pulled[high] - self.pulled[low]
+        return np.where(turned > STILL_BY_HAND_DEG, np.inf, change) if self.by_hand else change
+
+    def around(self, n: int) -> tuple[slice, bool]:
+        """Return the samples around n, of the same rest or in motion the nearest, and whether they are at rest."""
+        last = self.recording.samples - 1
+        for far in (self.long, self.long // 2, self.half):
+            a, b = max(n - far, 0), min(n + far, last)
+            if self.turned[b] - self.turned[a] <= self.still:
+                return slice(a, b + 1), True
+        a = max(int(np.searchsorted(self.turned, self.turned[n] - self.still)), n - self.long)
+        b = min(int(np.searchsorted(self.turned, self.turned[n] + self.still, "right")), n + self.long)
+        if b - a >= self.half:
+            return slice(a, b), True
+        return slice(max(n - self.half, 0), min(n + self.half, last) + 1), False
+
+    def scatter_of_rests(self, values: Values) -> float | None:
+        """Return the median scatter of windows at rest; None if too few of the windows are at rest."""
+        windows = [self.around(n) for n in np.linspace(0, len(values) - 1, WINDOWS).astype(int)]
+        scatters = [_scatter(values[window]) for window, resting in windows if resting]
+        return float(np.median(scatters)) if len(scatters) >= WINDOWS // 4 else None
+
+
+def leave_out_shaken_rests(recording: Recording, note: Callable[[str, Index, str], Note]) -> Recording:
+    """Remove shaken pieces of rests from a recording on a table, and note them as ``N-SHAKEN``."""
+    pieces = _pieces(recording)
+    if len(pieces) < FEWEST_PIECES:
+        return recording
+    found = {s: r for s in SENSOR_UNITS if (r := recording.reading(s)) is not None and np.isfinite(r).all()}
+    worst: tuple[float, str] = (0.0, "")
+    shaken = np.zeros(len(pieces), bool)
+    for sensor, reading in found.items():
+        excess, scatter = _excess(reading, pieces[:, :2])
+        shaken |= excess > 0.0
+        first = int(np.argmax(excess))
+        if excess[first] > worst[0]:
+            times = recording.time[pieces[first, 0]]
+            worst = float(excess[first]), f"the {sensor} scatters {scatter[first]:.1f} times as usual at {times:.6g} s"
+    count = int(shaken.sum())
+    if count == 0 or count > max(1.0, LARGEST_SHARE * len(pieces)):
+        return recording
+    rows = np.concatenate([np.arange(a, b) for a, b in pieces[shaken, 2:]])
+    detail = f"{count} of {len(pieces)} pieces of rests left out, in which the unit was shaken or leant on; {worst[1]}"
+    return without_rows(recording, rows, note("N-SHAKEN", rows, detail))
+
+
+def _pieces(recording: Recording) -> Index:
+    """Return start and stop of each piece of a rest, and of the samples to remove with it: (p, 4) array."""
+    none = np.zeros((0, 4), np.intp)
+    if recording.samples < MIN_PIECE_SAMPLES * FEWEST_PIECES or recording.role in ("rests", "static"):
+        return none
+    if recording.table_rate is not None:
+        still = np.abs(recording.table_rate) < AT_REST_DPS
+    elif recording.table_angle is not None:
+        step = np.abs(np.diff(recording.table_angle, prepend=recording.table_angle[0]))
+        still = np.maximum(step, np.append(step[1:], 0.0)) < AT_REST_DPS * recording.interval
+    else:
+        return none
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
+    size = max(MIN_PIECE_SAMPLES, round(PIECE_S / recording.interval))
+    out = []
+    settling = int(np.ceil(SETTLING_S / recording.interval))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        start, stop = begin + settling, end - settling
+        if stop - start < MIN_PIECE_SAMPLES:
+            continue
+        parts = -(-(stop - start) // size)
+        cuts = [start + (stop - start) * k // parts for k in range(parts + 1)]
+        whole = [begin, *cuts[1:-1], end]
+        spans = zip(itertools.pairwise(cuts), itertools.pairwise(whole), strict=True)
+        out += [(*inner, *outer) for inner, outer in spans if inner[1] - inner[0] >= MIN_PIECE_SAMPLES]
+    return np.array(out, np.intp).reshape(-1, 4)
+
+
+def _excess(reading: Values, pieces: Index) -> tuple[Values, Values]:
+    """Return the excess of each piece's chi^2 over its limit, and its scatter relative to the usual: (p,) arrays."""
+    count = np.diff(pieces, axis=1)[:, 0].astype(float)
+    bounds = pieces.ravel()
+    centred = np.append(reading - reading.mean(axis=0), np.zeros((1, 3)), axis=0)
+    sums, squares = (np.add.reduceat(v, bounds, axis=0)[::2] for v in (centred, centred**2))
+    about_mean = np.maximum(squares - sums**2 / count[:, None], 0.0)
+    step = np.abs(np.diff(reading, axis=0))
+    rounding = np.where(step > 0.0, step, np.inf).min(axis=0) ** 2 / 4.0  # between two counts
+    usual = np.maximum(median(about_mean / (count - 1.0)[:, None]), rounding)
+    chi = np.sum(about_mean / usual, axis=1)
+    freedom = 3.0 * (count - 1.0)
+    most = np.maximum(RATIO * freedom, freedom + SIGNIFICANT_DEVIATIONS * np.sqrt(2.0 * freedom) + CHI_SQUARE_TAIL)
+    for piece in np.flatnonzero(chi > most):
+        start, stop = pieces[piece]
+        own = reading[start:stop]
+        alone = np.sum((own - own.mean(axis=0)) ** 2 / usual, axis=1) * count[piece] / (count[piece] - 1.0)
+        chi[piece] -= float(alone.max())
+    return np.maximum(chi - most, 0.0), np.sqrt(chi / freedom)

@@ -1,0 +1,383 @@
+"""Check the quality of a recording: refuse impossible values; flag gaps, clipped and stuck readings for the fits.
+
+Refused are times at another rate than the stated one, a specific force far from gravity, readings beyond the range,
+rates that contradict the table or the rotation of gravity, and an attitude that is no rotation: the cause is nearly
+always a wrong unit or column. ``pipeline.checks.mounting`` checks the mounting.
+
+A reading is *stuck* where it is constant for longer than noise allows. The share ``p`` of equal neighbours in windows
+of 64 samples measures the noise of the channel. A run of ``L`` equal values among ``n`` is expected ``n p^(L-1)`` times
+by chance, and flagged if that is below 10^-6. If the 95th percentile of ``p`` exceeds one half, the noise is below the
+resolution, and no run is flagged.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from imu_logs.clocks import bursts_error, rounded_error
+from imu_logs.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TABLE_CHANNELS, TRIADS
+from pipeline.core.errors import IngestError
+from pipeline.core.records import SENSOR_UNITS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from imu_logs.log import Log
+    from imu_logs.profile import Checks
+    from pipeline.core.records import Index, Integers, Mask, Note
+    from pipeline.core.settings import Sensor
+
+GAP, CLIPPED, STUCK = np.uint16(1), np.uint16(2), np.uint16(4)  # bits of ``Recording.flags``
+GAP_INTERVALS = 1.5  # half way to one missing sample
+JITTER_NOTED, JITTER_TOO_LARGE = 0.2, 0.5  # rms, relative to the median interval; spectra need regular samples
+FULL_SCALE_MARGIN = 1.2  # sensors read up to a fifth beyond their nominal range
+RAIL = 1e-4  # relative; the largest code of 16 bits is 3e-5 below full scale
+FULL_SCALE_TOLERANCE = 1e-3  # relative; with nominal counts per unit the largest code may be above full scale by this
+NEIGHBOUR_WINDOW = 64  # samples in which the share of equal neighbours is counted
+EXPECTED_CHANCE_RUNS = 1e-6  # expected number of such runs in the recording
+SHORTEST_RUN = 20  # samples; the estimate of p from windows of 64 is too coarse for less
+FEWEST_STEPS = 64  # of the resolution: a channel with a smaller span shows noise alone
+EQUAL_NEIGHBOUR_SHARE = 0.5  # share of equal neighbours at which noise is below the resolution
+MAX_NOTED_STRETCHES = 10  # of stuck rows that have a note each; more are one note: ``check`` lists 20 notes of a file
+DEAD_ROWS = 1000  # shorter recordings may be constant by their resolution
+FORCE_RANGE_G = (0.3, 3.0)  # about 1 g at rest; another unit is wrong by a factor of 9.8 or 1000
+QUATERNION_TOLERANCE = 0.01  # components rounded to two decimals
+RATE_TOLERANCE = 0.2  # another unit of time is wrong by a factor of 1000
+MEDIAN_SAMPLES = 200_000  # samples that a median is taken of
+# Largest readings of a sensor at rest: gravity with a bias of a fifth, zero-rate output of consumer MEMS (MPU-6050
+# product specification 3.1). Where a log is coarse, a rest repeats such a reading although it is not clipped.
+REST_LIMITS = {"accelerometer": 1.2, "gyroscope": 20.0}
+TURNING_DPS = 5.0  # a smaller rate is of the size of a low-cost gyroscope's bias
+# Factors by which intervals are wrong, and the kind of times that this indicates.
+_OTHER_FACTORS = {
+    1e-3: "times of a unit a thousand times shorter", 1e3: "times of a unit a thousand times longer",
+    1e-6: "times of a unit a million times shorter", 1e6: "times of a unit a million times longer", 1e-9: "ns",
+}  # fmt: skip
+
+
+def flag_gaps(table: Log, flags: NDArray[np.uint16], checks: Checks) -> list[Note]:
+    """Flag gaps, and note irregular intervals; raise ``IngestError`` beyond ``checks.missing_time`` of missing time."""
+    steps = np.diff(table.time_ns)
+    usual = float(np.median(steps))
+    limit = GAP_INTERVALS * usual
+    if int(steps.max()) <= limit:
+        return _irregular(table, steps, usual)
+    rows = np.flatnonzero(steps > limit) + 1
+    flags[rows] |= GAP
+    lengths = steps[rows - 1]
+    lost = float(np.sum(lengths - usual)) / float(table.time_ns[-1] - table.time_ns[0])
+    detail = (
+        f"gaps longer than {GAP_INTERVALS} times the median interval of {usual / 1e6:.6g} ms; "
+        f"the longest lasts {lengths.max() / 1e9:.6g} s, {lost:.3%} of the time is missing"
+    )
+    if lost > checks.missing_time:
+        message = f"{rows.size} {detail}"
+        hint = f"ingest.checks.missing_time allows a share of {checks.missing_time:g}"
+        error = IngestError(message, table.place(int(rows[np.argmax(lengths)])), code="missing_time", hint=hint)
+        raise bursts_error(table) or rounded_error(table, error) or error
+    return [table.note("N-GAP", rows, detail), *_irregular(table, steps[steps <= limit], usual)]
+
+
+def _irregular(table: Log, steps: Integers, usual: float) -> list[Note]:
+    if not steps.size or int(steps.max()) - int(steps.min()) <= JITTER_NOTED * usual:
+        return []
+    jitter = float(np.sqrt(np.mean((steps / usual - 1.0) ** 2)))
+    if jitter <= JITTER_NOTED:
+        return []
+    detail = f"intervals scatter by {jitter:.0%} rms of their median of {usual / 1e6:.6g} ms"
+    if jitter > JITTER_TOO_LARGE:
+        detail += ": too irregular for spectra and Allan deviations"
+    return [table.note("N-JITTER", np.array([0, len(table.time_ns) - 1]), detail)]
+
+
+def flag_clipped(table: Log, sensor: str, full_scale: float, flags: NDArray[np.uint16]) -> list[Note]:
+    """Flag readings at full scale, g or deg/s; refuse those far beyond it."""
+    notes = []
+    for channel in TRIADS[sensor]:
+        if channel not in table.values:
+            continue
+        values = table.values[channel]
+        count = table.count_sizes.get(channel, 0.0)
+        largest = max(float(values.max()), -float(values.min()))
+        if largest < full_scale - max(1.5 * count, RAIL * full_scale):
+            continue
+        size = np.abs(values)
+        if largest > FULL_SCALE_MARGIN * full_scale:
+            row = int(np.argmax(size > FULL_SCALE_MARGIN * full_scale))
+            message = (
+                f"{channel} is {values[row]:.6g} {SENSOR_UNITS[sensor]} at {table.time_ns[row] / 1e9:.9g} "
+                f"s, beyond {FULL_SCALE_MARGIN} times the full scale of {full_scale:g}; correct "
+                f"ingest.csv.columns.{channel}.unit or sensor.{sensor}.full_scale"
+            )
+            raise IngestError(message, table.place(row), code="beyond_full_scale")
+        # Many sensors read beyond their nominal range (131 counts per deg/s reach 250.1 deg/s), some by a fifth: a
+        # largest value beyond the range that occurs more than once is clipped, too.
+        clipped = (size >= full_scale - max(1.5 * count, RAIL * full_scale)) & (
+            size <= (1.0 + FULL_SCALE_TOLERANCE) * full_scale
+        )
+        at_largest = size >= size.max() - 1.5 * count
+        if size.max() > full_scale and at_largest.sum() > 1:
+            clipped |= at_largest
+        rows = np.flatnonzero(clipped)
+        if rows.size:
+            flags[rows] |= CLIPPED
+            detail = f"{channel} reaches the full scale of {full_scale:g} {SENSOR_UNITS[sensor]} and may be clipped"
+            notes.append(table.note("N-CLIP", rows, detail))
+    return notes
+
+
+def flag_flat_tops(table: Log, sensor: str, flags: NDArray[np.uint16]) -> list[Note]:
+    """Flag readings that repeat the largest or the smallest value of their channel more often than noise allows.
+
+    The range of such a sensor or logger is smaller than is stated. k repetitions are expected ``n p^k`` times by
+    chance, with p as for stuck readings, of the other values. An end that a sensor may read at rest is none. Logs with
+    the motion of a table are not searched: a table may keep its largest rate, and its log contradicts a clipped
+    reading.
+    """
+    notes: list[Note] = []
+    if set(TABLE_CHANNELS) & table.values.keys():
+        return notes
+    for channel in TRIADS[sensor]:
+        if (values := table.values.get(channel)) is None:
+            continue
+        steps, ends = np.abs(np.diff(values)), (values.min(), values.max())
+        same = steps == 0.0
+        if ends[1] - ends[0] < FEWEST_STEPS * np.min(steps, where=~same, initial=np.inf):
+            continue
+        share = max(equal_share(same & (values[1:] != ends[0]) & (values[1:] != ends[1])), 1.0 / NEIGHBOUR_WINDOW)
+        for end in (e for e in ends if abs(e) > REST_LIMITS[sensor]):
+            at_end = values == end
+            rows = np.flatnonzero(at_end & ((flags & CLIPPED) == 0))
+            by_chance = len(values) * share ** np.count_nonzero(same & at_end[1:])
+            if not rows.size or share > EQUAL_NEIGHBOUR_SHARE or by_chance > EXPECTED_CHANCE_RUNS:
+                continue
+            flags[rows] |= CLIPPED
+            detail = (
+                f"{channel} repeats {end:.6g} {SENSOR_UNITS[sensor]}, the end of its readings, more often than noise "
+                f"allows: clipped below the stated sensor.{sensor}.full_scale, and left out of every fit"
+            )
+            notes.append(table.note("N-CLIP", rows, detail))
+    return notes
+
+
+def find_stuck(table: Log, sensor: str, flags: NDArray[np.uint16]) -> dict[str, Index]:
+    """Return the rows, by channel, of readings that are constant for longer than the noise of the channel allows.
+
+    Raises ``IngestError`` for an axis that is constant in half of the rows or more, while the other axes of its sensor
+    change.
+    """
+    neighbours = {c: v[1:] == v[:-1] for c in TRIADS[sensor] if (v := table.values.get(c)) is not None}
+    found = {}
+    for channel, same in neighbours.items():
+        if not _in_a_row(same, SHORTEST_RUN - 1):
+            continue
+        others = [not s.any() or equal_share(s) <= EQUAL_NEIGHBOUR_SHARE for c, s in neighbours.items() if c != channel]
+        dead = bool(same.all()) and len(same) >= DEAD_ROWS
+        rows = _stuck_rows(same, equal_share(same))
+        rows = np.arange(len(same)) if dead else rows[(flags[rows] & CLIPPED) == 0]
+        if not rows.size:
+            continue
+        value = f"{table.values[channel][rows[0]] + 0.0:.6g} {SENSOR_UNITS[sensor]}"
+        if rows.size >= len(same) / 2 and others and all(others):
+            part = f"stays at one value for longer than its noise allows in {rows.size} of"
+            what = f"is {value} in all" if dead else part
+            message = f"{channel} {what} {len(same) + 1} rows, while the other axes change"
+            hint = "is the column right, and the sensor's axis alive?"
+            raise IngestError(message, table.path if dead else table.place(int(rows[0])), code="stuck", hint=hint)
+        if rows.size < len(same) / 2:
+            found[channel] = rows
+    return found
+
+
+def _common_rows(found: Mapping[str, Index]) -> dict[str, Index]:
+    """Cut runs that are longer, by chance, than the runs of other channels that were stuck at the same time."""
+    runs = {c: np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) for c, rows in found.items()}
+    starts, stops = (np.array([run[end] for of in runs.values() for run in of]) for end in (0, -1))
+
+    def cut(first: int, last: int) -> Index:
+        first = starts[(starts >= first) & (starts < first + SHORTEST_RUN) & (starts <= last)].max()
+        last = stops[(stops <= last) & (stops > last - SHORTEST_RUN) & (stops >= first)].min()
+        return np.arange(first, last + 1)
+
+    return {c: np.concatenate([cut(int(run[0]), int(run[-1])) for run in of]) for c, of in runs.items()}
+
+
+def flag_stuck(table: Log, found: Mapping[str, Index], flags: NDArray[np.uint16]) -> list[Note]:
+    """Flag stuck rows; return a note for each stretch of rows, or one note if there are many stretches."""
+    if not found:
+        return []
+    found = _common_rows(found)
+    temperature = table.values.get("temperature")
+    same = None if temperature is None else temperature[1:] == temperature[:-1]
+    every = np.unique(np.concatenate([*found.values()]))
+    stretches = np.split(every, np.flatnonzero(np.diff(every) > 1) + 1)
+    where = f" in {len(stretches)} places" if len(stretches) > MAX_NOTED_STRETCHES else ""
+    notes = []
+    flags[every] |= STUCK
+    for rows in [every] if where else stretches:
+        first_rows = {channel: stuck[0] for channel, at in found.items() if (stuck := at[np.isin(at, rows)]).size}
+        channel, row = next(iter(first_rows.items()))
+        unit = next(SENSOR_UNITS[sensor] for sensor, triad in TRIADS.items() if channel in triad)
+        one = f"stays at {table.values[channel][row] + 0.0:.6g} {unit}"
+        stay = one if len(first_rows) == 1 and not where else f"stay{'s' * (len(first_rows) == 1)} at one value{where}"
+        first, last = int(rows[0]), int(rows[-1])
+        detail = f"{', '.join(first_rows)} {stay} for longer than noise allows"
+        if not where:
+            detail += f", for {(table.time_ns[last] - table.time_ns[first]) / 1e9:.3g} s"
+        if not where and "table_angle" in table.values:
+            detail += (
+                f" while the table turns by {abs(np.subtract(*table.values['table_angle'][[last, first]])):.3g} deg"
+            )
+        if not where and same is not None and same[first:last].all() and equal_share(same) <= EQUAL_NEIGHBOUR_SHARE:
+            detail += ", and the temperature with them"
+        notes.append(table.note("N-STUCK", rows, f"{detail}: stuck, and left out of every fit"))
+    return notes
+
+
+def equal_share(same: Mask) -> float:
+    """Return the 95th percentile of the share of equal neighbours, over windows that are not entirely equal."""
+    whole = len(same) // NEIGHBOUR_WINDOW * NEIGHBOUR_WINDOW
+    if whole == 0:
+        return 1.0
+    shares = (
+        np.bincount(np.flatnonzero(same[:whole]) // NEIGHBOUR_WINDOW, minlength=whole // NEIGHBOUR_WINDOW)
+        / NEIGHBOUR_WINDOW
+    )
+    partial = shares[shares < 1.0]
+    if not partial.size:
+        return 1.0
+    place = 0.95 * (partial.size - 1)  # np.quantile costs more than the rest of this function
+    return float(np.interp(place, np.arange(partial.size), np.sort(partial)))
+
+
+def _stuck_rows(same: Mask, share: float) -> Index:
+    """Return the rows in runs of equal values that are too long for chance."""
+    if share > EQUAL_NEIGHBOUR_SHARE:
+        return np.zeros(0, np.intp)
+    p = max(share, 1.0 / NEIGHBOUR_WINDOW)
+    longest = max(SHORTEST_RUN, int(np.ceil(np.log(EXPECTED_CHANCE_RUNS / len(same)) / np.log(p))) + 1)
+    if not _in_a_row(same, longest - 1):
+        return np.zeros(0, np.intp)
+    edges = np.flatnonzero(np.diff(same, prepend=False, append=False))
+    starts, stops = edges[::2], edges[1::2]
+    long = stops - starts + 1 >= longest
+    return np.concatenate([np.arange(a, b + 1) for a, b in zip(starts[long], stops[long], strict=True)])
+
+
+def _in_a_row(same: Mask, count: int) -> bool:
+    """Return whether ``count`` successive neighbours are equal."""
+    places, further = np.flatnonzero(same), count - 1
+    return bool(np.any(places[further:] - places[: max(len(places) - further, 0)] == further))
+
+
+def examine(table: Log, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[np.uint16] | None, list[Note]]:
+    """Return quality flags (None if none is set) and notes; raise ``IngestError`` for impossible values.
+
+    ``sensor``: with the full scales; None if they are not known.
+    """
+    for channels in (*TRIADS.values(), ATTITUDE):
+        missing = [c for c in channels if c not in table.values]
+        if 0 < len(missing) < len(channels):
+            message = f"{', '.join(missing)} missing; {', '.join(channels)} come together or not at all"
+            raise IngestError(message, table.path, code="missing_column")
+    if len(table.time_ns) < 2:
+        raise IngestError(f"{len(table.time_ns)} data rows; at least 2 are needed", table.path, code="no_rows")
+    _check_rate(table, checks)
+    _check_force(table)
+    _check_attitude(table)
+    flags = np.zeros(len(table.time_ns), np.uint16) if table.flags is None else table.flags.copy()
+    notes = flag_gaps(table, flags, checks)
+    stuck: dict[str, Index] = {}
+    for name in TRIADS:
+        if sensor is not None:
+            notes += flag_clipped(table, name, sensor.of(name).full_scale, flags)
+        notes += flag_flat_tops(table, name, flags)
+        stuck |= find_stuck(table, name, flags)
+    notes += flag_stuck(table, stuck, flags)
+    _check_turn_rate(table)
+    return (flags if flags.any() else None), notes
+
+
+def _check_rate(table: Log, checks: Checks) -> None:
+    if checks.rate_hz is None:
+        return
+    interval_us = float(np.median(np.diff(table.time_ns))) / 1e3
+    ratio = interval_us * checks.rate_hz / 1e6
+    if abs(ratio - 1.0) <= RATE_TOLERANCE:
+        return
+    unit = ""
+    for factor, times in _OTHER_FACTORS.items():
+        if abs(ratio * factor - 1.0) <= RATE_TOLERANCE:
+            unit = f"; the numbers look like {times}"
+    message = (
+        f"the median interval is {interval_us:g} us, and ingest.checks.rate_hz of {checks.rate_hz:g} Hz expects "
+        f"{1e6 / checks.rate_hz:g} us{unit}"
+    )
+    hint = "correct ingest.csv.columns.time.unit or ingest.checks.rate_hz"
+    raise IngestError(message, table.path, code="wrong_rate", hint=hint)
+
+
+def _check_force(table: Log) -> None:
+    if "accel_x" not in table.values:
+        return
+    stride = -(-len(table.time_ns) // MEDIAN_SAMPLES)
+    squares = np.asarray(sum(table.values[c][::stride] ** 2 for c in TRIADS["accelerometer"]))
+    usual = float(np.sqrt(np.median(squares)))
+    low, high = FORCE_RANGE_G
+    if low <= usual <= high:
+        return
+    hint = "is the unit or the scale right?"
+    for unit, factor in (*FORCE_UNITS.items(), ("g that were declared as m/s^2", 1.0 / STANDARD_GRAVITY)):
+        if 0.7 < usual / factor < 1.4:
+            hint = f"the numbers look like {unit}"
+    if usual > 1500.0:
+        hint = "the numbers look like raw counts, which need counts_per_unit"
+    message = (
+        f"median specific force is {usual:.4g} g, and a log of rests and turns has about 1 g (allowed {low} to "
+        f"{high}): {hint}; correct ingest.csv.columns.accel_x.unit (accel_y, accel_z)"
+    )
+    raise IngestError(message, table.path, code="implausible_force")
+
+
+def _check_attitude(table: Log) -> None:
+    if ATTITUDE[0] not in table.values:
+        return
+    norm = np.sqrt(sum(table.values[c] ** 2 for c in ATTITUDE))
+    wrong = np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)
+    if wrong.size:
+        row = int(wrong[0])
+        message = (
+            f"the table's quaternion has the length {norm[row]:.4g} at {table.time_ns[row] / 1e9:.9g} s "
+            f"({wrong.size} such samples); 1 is expected"
+        )
+        raise IngestError(message, table.place(row), code="bad_attitude")
+
+
+def _check_turn_rate(table: Log) -> None:
+    """Raise ``IngestError`` if rates differ by a factor of 180/pi from the table's, or from gravity's rotation."""
+    if "gyro_x" not in table.values:
+        return
+    stride = -(-len(table.time_ns) // MEDIAN_SAMPLES)
+    if "table_rate" in table.values:
+        rate = np.abs(table.values["table_rate"][::stride])
+        turning = rate > max(TURNING_DPS, 0.3 * float(rate.max()))
+        if turning.sum() < 20:
+            return
+        size = np.sqrt(sum(table.values[c][::stride][turning] ** 2 for c in TRIADS["gyroscope"]))
+        ratio = float(np.median(size / rate[turning]))
+        seen = f"while the table turns the angular rate is {ratio:.3g} times the table's"
+    else:
+        from pipeline.ingest.gravity_rotation import declared_scale  # noqa: PLC0415  (imported where there is no table)
+
+        found = declared_scale(table)
+        if found is None:
+            return
+        ratio, seen = found
+    for factor, what in ((1 / DEGREES, "rad/s that were declared as deg/s"), (DEGREES, "deg/s declared as rad/s")):
+        if 0.7 < ratio / factor < 1.4:
+            hint = "correct ingest.csv.columns.gyro_x.unit (gyro_y, gyro_z)"
+            raise IngestError(f"{seen}: the numbers look like {what}", table.path, code="implausible_rate", hint=hint)

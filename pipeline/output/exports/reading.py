@@ -1,0 +1,296 @@
+"""Read a calibration from a file in one of the formats.
+
+The declaration of a template states under ``read_back`` how its file is read: the ``kind`` of text
+(``pipeline.output.exports.text_kinds``), and for each sensor ``where``, the path of a value that exists only if the file
+contains this sensor, and an expression for each quantity:
+
+    bias | bias_after_matrix | bias_polynomial,   matrix | K,   g_sensitivity, scale_factor_temperature, bias_deviation
+
+``truth = matrix (reading - bias - effects)`` in the unit of the format; ``K = matrix^-1``.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jinja2 import TemplateError
+
+from imu_logs.files import read_text
+from pipeline.core.errors import ConfigurationError, InputError, MissingInputError, shortened
+from pipeline.output.exports import formats
+from pipeline.output.exports.sensors import TEMPLATE_FUNCTIONS, UNIT_FACTORS
+from pipeline.output.exports.text_kinds import Expressions, Node, parsed
+from pipeline.ingest.axis_maps import STRAIGHT, maps_of_log
+from pipeline.physics.calibration_file import read_calibration, sensor_of
+from pipeline.physics.effects import effect
+from pipeline.core.pack import is_published, read_published
+from pipeline.core.records import BASE_COUNT, BIAS, SENSORS, FittedEffect, SensorCalibration
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.output.exports import Format
+    from pipeline.output.exports.sensors import SensorFigures
+    from pipeline.core.records import Values
+
+CALIBRATION = "calibration.json"  # name of the format of ``calibrations/<unit>.json``
+# of a file to read; a calibration has some kilobytes, the parameters of a vehicle 100
+MAX_CALIBRATION_BYTES = 50_000_000
+UNIT_SCALE = (0.5, 2.0)  # range of the singular values of a matrix if readings and truth have the same unit
+EFFECT_IN_C = re.compile(r"r\[\d\] -= .*/\* (\w+) \*/")  # a line of calibration.h
+TURNED_READINGS = re.compile(r"Turn\s+the\s+readings\s+to\s+body\s+axes\s+first:\s[^.]*\.")  # a remark in our exports
+FRAME_REMARK = re.compile(r"the (\w+)'s x along")  # in such a remark: a sensor, or "sensor" for both
+BODY_AXIS = re.compile(r"along body ([+-][xyz])")
+NOISE_ALONE = re.compile(r"^\s*(accelerometer|gyroscope)_noise_density\s*:", re.MULTILINE)  # Kalibr's imu.yaml
+FORMAT_ROUNDING = 1e-12  # rounding errors of the formats' arithmetic, relative to the largest number
+
+
+@dataclass(frozen=True)
+class ImportedCalibration:
+    """A calibration from a file."""
+
+    format_name: str
+    unit: str  # stem of the file if the format has no name of the unit
+    sensors: dict[str, SensorCalibration]  # the covariance is None if the file states no uncertainty
+    noise: dict[str, float] = field(default_factory=dict)  # the stated ones of Kalibr's four parameters
+    notes: list[str] = field(default_factory=list)  # assumptions, and values that were not read
+    document: dict[str, Any] | None = None  # ``calibrations/<unit>.json``, if the file is in this format
+    stated_axes: dict[str, tuple[str, ...]] = field(default_factory=dict)  # axis map of each sensor; empty: not stated
+
+    @property
+    def axis_maps(self) -> dict[str, tuple[str, ...]]:
+        """Sensor to the body axes along which its reading axes point."""
+        log = {"axis_map": self.stated_axes} if self.document is None else self.document.get("log")
+        return maps_of_log(log or {})
+
+
+def read_any(
+    file: Path, format_name: str | None = None, counts: Mapping[str, float | None] | None = None
+) -> ImportedCalibration:
+    """Read a calibration in any format; if the format has a file for each sensor, ``file`` is one of them.
+
+    ``format_name``: a name or its beginning (``format_of``), by default found from name and content of the file;
+    ``counts``: sensor to its counts per g or deg/s, for formats in counts. Raises ``ConfigurationError`` if no format
+    or several formats have this name, ``InputError`` if the file lacks values that the format needs.
+    """
+    name = None if format_name is None else format_of(format_name)
+    if not is_published(file):
+        raise MissingInputError("there is no such calibration", str(file))
+    text = _text(file)
+    name = name or _recognised(file, text)
+    if name == CALIBRATION:
+        document = read_calibration(file)
+        sensors = {s: c for s in SENSORS if (c := sensor_of(document, s, file)) is not None}
+        for s, c in sensors.items():  # a published calibration has zeros for an unknown uncertainty
+            if c.covariance is None or not np.any(np.diag(c.covariance) > 0.0):
+                sensors[s] = replace(c, covariance=None)
+        return ImportedCalibration(name, str(document["unit"]), sensors, document=document)
+    declared = formats()[name][0]
+    if not declared.read_back:
+        raise InputError(f"the format {name} holds no calibration that can be read: {declared.equation}", str(file))
+    files = _files_of(file, declared)
+    parts = [_read_file(each, name, declared, counts or {}) for each in files]
+    sensors = {s: c for part in parts for s, c in part.sensors.items()}
+    notes = [f"read together with it: {each.name}" for each in files if each != file]
+    return replace(parts[0], sensors=sensors, notes=[*notes, *(note for part in parts for note in part.notes)])
+
+
+def _files_of(file: Path, declared: Format) -> list[Path]:
+    """Return the file and, if each sensor has a separate file, the file of the other sensor in the same folder."""
+    endings = declared.sensor_endings.values()
+    ending = next((e for e in endings if file.stem.endswith(e)), None)
+    if ending is None:
+        return [file]
+    files = [file.with_stem(file.stem.removesuffix(ending) + e) for e in endings]
+    return [each for each in files if is_published(each)]
+
+
+def _text(file: Path) -> str:
+    return read_text(file, MAX_CALIBRATION_BYTES, "a calibration") if file.exists() else read_published(file).decode()
+
+
+def _read_file(
+    file: Path, format_name: str, declared: Format, counts: Mapping[str, float | None]
+) -> ImportedCalibration:
+    text = _text(file)
+    try:
+        imported = _read(file, format_name, declared, parsed(declared.read_back["kind"], text), counts)
+    except (TemplateError, KeyError, ValueError, TypeError, np.linalg.LinAlgError) as error:
+        reason = error.args[0] if isinstance(error, KeyError) else error
+        raise InputError(f"this is no {format_name} ({declared.consumer}): {reason}", str(file)) from error
+    turned = [" ".join(remark.split()) for remark in TURNED_READINGS.findall(text)]
+    imported.notes.extend(turned)
+    if effects := dict.fromkeys(EFFECT_IN_C.findall(text)):
+        imported.notes.append(f"effects in C expressions, which are not read: {', '.join(effects)}")
+    return replace(imported, stated_axes=_stated_axes(turned))
+
+
+def _stated_axes(remarks: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Return the axis map of each sensor from the remarks of a file; empty without a remark."""
+    stated = {
+        owner[1]: tuple(BODY_AXIS.findall(remark)) for remark in remarks if (owner := FRAME_REMARK.search(remark))
+    }
+    return {s: stated.get(s) or stated.get("sensor") or STRAIGHT for s in SENSORS} if stated else {}
+
+
+def counts_of(sheets: Mapping[str, SensorFigures]) -> dict[str, float | None]:
+    """Return the counts per g or deg/s of each sensor; None if not stated."""
+    return {s: sheets[s].counts_per_unit if s in sheets else None for s in SENSORS}
+
+
+def format_of(words: str) -> str:
+    """Return the only format with this name, beginning of its name, or file name."""
+    names = [CALIBRATION, *formats()]
+    fitting = (
+        [name for name in names if words in (name, name.partition(".")[0])]
+        or [name for name in names if name.startswith(words)]
+        or [name for name, (d, _) in formats().items() if fnmatchcase(words, d.file.replace("{unit}", "*"))]
+    )
+    if len(fitting) == 1:
+        return fitting[0]
+    raise ConfigurationError(f"{words} is the name of {'several formats' if fitting else 'no format'}: "
+                             f"{', '.join(fitting or names)}; choose one (convert --from, --to)")  # fmt: skip
+
+
+def _recognised(file: Path, text: str) -> str:
+    """Return the name of the only format whose keys are in the file."""
+    declarations = {name: declared for name, (declared, _) in formats().items() if declared.read_back}
+    if file.name in formats():
+        return file.name
+    fitting = []
+    for name, declared in declarations.items():
+        with suppress(ValueError):
+            if _sensors_in(file, declared, parsed(declared.read_back["kind"], text)):
+                fitting.append(name)
+    with suppress(ValueError):
+        document = json.loads(text)
+        if isinstance(document, dict) and {"schema_version", "status", *SENSORS} <= set(document):
+            fitting = [CALIBRATION]
+    if len(fitting) == 1:
+        return fitting[0]
+    if NOISE_ALONE.search(text):
+        message = "holds the noise of a sensor for a filter, and no calibration; name Kalibr's result in its place"
+        raise InputError(message, str(file))
+    names = ", ".join(fitting or [CALIBRATION, *declarations])
+    reason = "the file fits several formats" if fitting else "the file has the keys of no format"
+    raise InputError(f"{reason}: {names}; name it (convert --from, method.format)", str(file))
+
+
+def _sensors_in(file: Path, declared: Format, content: Node) -> dict[str, dict[str, str]]:
+    """Return the expressions for the sensors in a file."""
+    read_back, endings = declared.read_back, declared.sensor_endings
+    expressions = {s: read_back["sensor"] for s in endings if file.stem.endswith(endings[s])} or read_back
+    return {
+        s: dict(expressions[s])
+        for s in SENSORS
+        if s in expressions and any(map(content.has, expressions[s]["where"].split(" | ")))
+    }
+
+
+def _read(
+    file: Path, format_name: str, declared: Format, content: Node, counts: Mapping[str, float | None]
+) -> ImportedCalibration:
+    sensors = _sensors_in(file, declared, content)
+    if not sensors:
+        names = [
+            f"a name that ends in {ending}{Path(declared.file).suffix}" for ending in declared.sensor_endings.values()
+        ]
+        wanted = " or ".join(names) or ", ".join(
+            str(declared.read_back[s]["where"]) for s in SENSORS if s in declared.read_back
+        )
+        raise InputError(f"this is no {format_name} ({declared.consumer}): expected {wanted}", str(file))
+    per_unit = {s: counts.get(s) for s in SENSORS}
+    lacking = [s for s in declared.required_counts if s in sensors and not per_unit[s]]
+    if lacking:
+        raise InputError(
+            f"{format_name} is in counts: state the sensor, whose config states the counts per unit", str(file)
+        )
+    omitted = {k: v for k, v in declared.read_back.get("defaults", {}).items() if k not in content}
+    notes = (
+        [f"not in the file, so the default: {', '.join(f'{k} = {v:g}' for k, v in omitted.items())}"] if omitted else []
+    )
+    tree = Expressions({**TEMPLATE_FUNCTIONS, "file": Node({**content, **omitted}), "counts": per_unit})
+    calibrations = {}
+    for s, expressions in sensors.items():
+        tree.globals |= {key: tree.value(e) for key, e in declared.read_back.get("let", {}).items()}
+        if "model" in expressions:
+            tree.globals["model"] = tree.value(expressions["model"])
+        values = {key: tree.value(e) for key, e in expressions.items() if key not in ("where", "model")}
+        calibrations[s] = _calibration(s, declared, values, per_unit[s], notes)
+    noise = {key: float(np.ravel(content.at(path))[0]) for key, path in declared.read_back.get("noise", {}).items()
+             if content.has(path) and content.at(path) is not None}  # fmt: skip
+    unread = content.unread()
+    if unread:
+        notes.append(f"not read: {', '.join(shortened(unread, 12))}")
+    notes += [f"{s}: the file states no bias; it counts as 0" for s, c in calibrations.items() if not np.any(c.bias)]
+    return ImportedCalibration(format_name, file.stem, calibrations, noise, notes)
+
+
+def _calibration(
+    sensor: str, declared: Format, values: Mapping[str, Any], counts: float | None, notes: list[str]
+) -> SensorCalibration:
+    """Return the calibration in g and deg/s from the values of the format's expressions."""
+    factor = UNIT_FACTORS[declared.units[sensor]]
+    arrays = {key: np.asarray(value, float) for key, value in values.items()}
+    matrix = arrays["matrix"].reshape(3, 3) if "matrix" in arrays else np.linalg.inv(arrays["K"].reshape(3, 3))
+    if "bias_polynomial" in arrays:
+        polynomial = arrays["bias_polynomial"].reshape(3, -1)
+    elif "bias_after_matrix" in arrays:
+        polynomial = np.linalg.solve(matrix, arrays["bias_after_matrix"].ravel())[:, None]
+    else:
+        polynomial = arrays["bias"].reshape(3, 1)
+    raw = factor  # units of the format per g or deg/s of a reading
+    sizes = np.linalg.svd(matrix, compute_uv=False)
+    if not UNIT_SCALE[0] < sizes[2] <= sizes[0] < UNIT_SCALE[1]:
+        if (
+            counts is None
+            or not UNIT_SCALE[0] < sizes[2] * counts / factor <= sizes[0] * counts / factor < UNIT_SCALE[1]
+        ):
+            raise ValueError(
+                f"the matrix of the {sensor} multiplies readings by {sizes[2]:.3g} to {sizes[0]:.3g}: they are not in "
+                f"{declared.units[sensor]}, and not in the counts of the sensor that is stated "
+                f"({counts or 'none; state it'})"
+            )
+        notes.append(f"{sensor}: readings in counts, {counts:g} per unit: its matrix multiplies by {sizes[0]:.3g}")
+        matrix, raw = matrix * counts / factor, counts
+    if not all(np.isfinite(array).all() for array in (polynomial, matrix)):
+        raise ValueError(f"{sensor}: a number is not finite")
+    polynomial = polynomial / raw
+    if (largest := float(np.abs(arrays.get("left_out", 0.0)).max())) > FORMAT_ROUNDING:
+        notes.append(f"{sensor}: cross-axis terms change by up to {largest:.2g} per degC, which is not read")
+    effects = _thermal(sensor, polynomial, notes)
+    for name, unit in (("g_sensitivity", raw), ("scale_factor_temperature", 1.0)):
+        if np.any(values_of := arrays.get(name, np.zeros(1))):
+            effects.append(_fitted(name, sensor, values_of.ravel() / unit))
+    covariance = None
+    if "bias_deviation" in arrays and np.any(arrays["bias_deviation"]):
+        size = BASE_COUNT + sum(len(e.parameters) for e in effects)
+        covariance = np.zeros((size, size))
+        covariance[BIAS, BIAS] = np.diag((arrays["bias_deviation"].ravel() / raw) ** 2)
+        notes.append(f"{sensor}: the file states an uncertainty of the bias, and none of the matrix")
+    return SensorCalibration(sensor, polynomial[:, 0], matrix, effects=tuple(effects), covariance=covariance)
+
+
+def _thermal(sensor: str, polynomial: Values, notes: list[str]) -> list[FittedEffect]:
+    """Return the effect of a bias that is a polynomial in T - 25 degC: coefficients (3, k)."""
+    polynomial = np.where(np.abs(polynomial) > FORMAT_ROUNDING * np.abs(polynomial).max(), polynomial, 0.0)
+    if np.any(polynomial[:, 4:]):
+        notes.append(f"{sensor}: the bias beyond the third order of the temperature is left out")
+    if np.any(polynomial[:, 3:4]):
+        return [_fitted("bias_temperature_cubic", sensor, polynomial[:, 1:4].ravel())]
+    if np.any(polynomial[:, 2:3]):
+        return [_fitted("bias_temperature_quadratic", sensor, polynomial[:, 1:3].ravel())]
+    return [_fitted("bias_temperature", sensor, polynomial[:, 1])] if np.any(polynomial[:, 1:2]) else []
+
+
+def _fitted(name: str, sensor: str, values: Values) -> FittedEffect:
+    """Return a built-in effect with its values and unknown uncertainty."""
+    named = zip(effect(name).parameters(sensor), values.tolist(), strict=True)
+    return FittedEffect(name, {p.name: {"value": v, "unit": p.unit, "expanded_uncertainty": None} for p, v in named})

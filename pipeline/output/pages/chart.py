@@ -1,0 +1,310 @@
+"""Charts as inline SVG: panels one above the other on a common axis x, with lines, samples, dots, bands and levels.
+
+Colours are CSS classes of the page (``c0`` to ``c5``), so that a chart follows the page's dark mode. The chart (axis x)
+and each panel (axis y) have an attribute ``data-scale``: low, high, their positions in pixels, kind and label of the
+axis. The script of the page uses it to read values and to zoom.
+
+Coordinates are whole tenths of a pixel and paths are written as differences, which keeps a page small. Many samples are
+drawn as the range from the smallest to the largest of equal buckets, so that no extreme is lost (S. Steinarsson,
+Downsampling Time Series for Visual Representation, University of Iceland 2013, section 4.1). Each such path has all its
+samples in ``data-full``, from which the script draws a zoom: 16-bit numbers (base64) from -32767 at the low end of the
+axis to 32767 at the high end, -32768 for no value. ``data-full`` of the chart is x.
+"""
+
+from __future__ import annotations
+
+import re
+from base64 import b64encode
+from dataclasses import dataclass, replace
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from markupsafe import Markup
+
+from pipeline.output.pages.axis import SUBDIVISION, Axis
+from pipeline.output.pages.numbers import typeset
+from pipeline.output.pages.pages import template
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.core.records import Integers, Values
+    from pipeline.output.pages.axis import Tick
+
+AXES_LEGEND = (("c0", "x"), ("c1", "y"), ("c2", "z"))
+CHART_WIDTH = 420  # px, of the drawing; the page scales it
+LEFT, RIGHT, TOP, BOTTOM, PANEL_GAP = 64, 14, 8, 36, 14  # px, margins of the panels and the gap between two
+UPRIGHT = 28  # px, of height for each tick of axis y
+MAXIMUM_DOTS = 240  # samples drawn as dots; about one in 1.4 px
+BUCKETS = 140  # ranges drawn for more samples; about one in 2.4 px
+MAXIMUM_FULL = 20_000  # samples of a curve in a page (53 kB); of more samples, the ends of half as many buckets
+LARGE_DOTS, LARGE_MEANS = 300, 40  # dots, and dots with intervals, that have room to be large
+LETTER = 6.2  # px, width of a letter
+
+
+@dataclass(frozen=True)
+class Figure:
+    """The texts of a chart, and the chart once it is drawn.
+
+    ``name``: identifier, unique on its page; ``finding``: the sentence above the chart, which states its result;
+    ``caption``: the text below it, which explains its elements; ``legend``: CSS class and text of each colour;
+    ``quiet``: nothing exceeds the noise, so the page folds the chart.
+    """
+
+    name: str
+    finding: str
+    caption: str = ""
+    legend: tuple[tuple[str, str], ...] = ()
+    quiet: bool = False
+    svg: str = ""
+
+    def drawn(self, description: str, height: float, content: str, attributes: str = "") -> Figure:
+        """Return the figure with drawn content as its ``svg`` element; the description is for screen readers."""
+        name, finding = escape(self.name), typeset(self.finding)
+        svg = Markup(  # noqa: S704  (every text in it is escaped where it is written)
+            f'<svg class="chart" viewBox="0 0 {CHART_WIDTH} {height:g}" role="img" aria-labelledby="{name}-t {name}-d"'
+            f'{attributes}><title id="{name}-t">{escape(finding)}</title>'
+            f'<desc id="{name}-d">{escape(typeset(description))}</desc>{content}</svg>'
+        )
+        return replace(self, svg=svg, finding=finding, caption=typeset(self.caption))
+
+
+def sentences(figure: str, **values: Any) -> tuple[str, str, str]:  # noqa: ANN401
+    """Return the sentences of a chart by its macro in ``templates/figures.txt``: finding, caption, description."""
+    text = str(getattr(template("figures.txt").module, figure)(**values))
+    finding, caption, *description = (re.sub(r"[ \n]+", " ", part).strip() for part in text.split("---\n"))
+    return finding, caption, " ".join(description)
+
+
+@dataclass(frozen=True)
+class LineMark:
+    """Values joined by a line, broken where one is not finite; ``style``: "", ``dashed``, ``model`` or ``thick``."""
+
+    x: Values
+    y: Values
+    colour: int = 0
+    style: str = ""
+
+
+@dataclass(frozen=True)
+class SampleMarks:
+    """Samples in order, (n,) or (n, k) with a colour for each column, drawn as dots or as ranges of buckets.
+
+    ``mean`` adds the line of the buckets' means, which shows slow changes below the noise.
+    """
+
+    x: Values
+    y: Values
+    colour: int = 0
+    mean: bool = False
+
+
+@dataclass(frozen=True)
+class Dots:
+    """Separate values, with an upright interval ``low`` to ``high`` where it is given.
+
+    ``units``: index of each value in the list of the chart's units, counted from 1, where it is not x.
+    """
+
+    x: Values
+    y: Values
+    colour: int = 0
+    low: Values | None = None
+    high: Values | None = None
+    units: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Area:
+    """The area between two curves, or over the whole axis x from one value to another."""
+
+    low: Values | float
+    high: Values | float
+    colour: int = 5
+    x: Values | None = None
+
+
+ChartLayer = LineMark | SampleMarks | Dots | Area
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One field of a chart: layers in the order in which they are drawn, and its axis y.
+
+    ``height``: px; ``levels``: horizontal lines by their text; ``limits``: of the axis, by default from the layers;
+    ``names``: x, y and text of points, left out where texts would overlap; ``rows``: names of y = 1, 2, ...
+    """
+
+    layers: list[ChartLayer]
+    label: str
+    height: int = 140
+    levels: Mapping[str, float] | None = None
+    limits: tuple[float, float] | None = None
+    logarithmic: bool = False
+    names: Sequence[tuple[float, float, str]] = ()
+    rows: Sequence[str] = ()
+
+
+def chart(
+    figure: Figure,
+    description: str,
+    panels: list[Panel],
+    x_label: str,
+    *,
+    kind: str = "",
+    margin: float = 0.0,
+    left: int = LEFT,
+    columns: Sequence[str] = (),
+    units: str = "",
+) -> Figure:
+    """Return a figure with its chart: panels that share the axis x.
+
+    ``description``: for screen readers; ``x_label``: of the axis x; ``kind``: of the axis x, "", "angle" (deg),
+    "count" or "log"; ``margin``: share of the values' range by which the axis x exceeds it; ``left``: space for the
+    ticks of the axes y, px; ``columns``: names of x = 1, 2, ...; ``units``: list in the script of the page that names
+    the units.
+    """
+    values = {id(layer.x): layer.x for p in panels for layer in p.layers if layer.x is not None}
+    x = Axis.over(values.values(), left, CHART_WIDTH - RIGHT, kind, margin)
+    ticks = x.ticks(6, columns)
+    parts, top = [], float(TOP)
+    for panel in panels:
+        parts.append(_panel(panel, x, ticks, top))
+        top += panel.height + PANEL_GAP
+    labels = "".join(text(at, top - PANEL_GAP + 13, label, "m") for at, label in ticks)
+    parts.append(f'<g class="ticks">{labels}</g>')
+    parts.append(text((x.start + x.stop) / 2, top - PANEL_GAP + 28, x_label, "m"))
+    attributes = x.attribute(x_label, columns) + (f' data-names="{units}"' if units else "")
+    long = [
+        layer for p in panels for layer in p.layers if isinstance(layer, SampleMarks) and len(layer.x) > MAXIMUM_DOTS
+    ]
+    attributes += _full(long[0].x, long[0].x, x) if long else ""
+    return figure.drawn(description, top - PANEL_GAP + BOTTOM, "".join(parts), attributes)
+
+
+def text(x: float, y: float, content: str, kind: str = "") -> str:
+    """Return a text element; ``kind`` is its CSS class (``e`` right-aligned, ``m`` centred, ``b`` bold)."""
+    return f'<text x="{x:.4g}" y="{y:.4g}" class="{kind}">{escape(typeset(content))}</text>'
+
+
+def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
+    bottom = top + panel.height
+    kind, margin = "log" if panel.logarithmic else "", 0.04 if panel.limits is None else 0.0
+    values = [np.array(panel.limits)]
+    if not panel.limits:
+        heights = (getattr(layer, end, None) for layer in panel.layers for end in ("y", "low", "high"))
+        values = [np.asarray(v) for v in heights if v is not None]
+    levels = panel.levels or {}
+    y = Axis.over([*values, np.array([*levels.values()], float)], bottom, top, kind, margin)
+    ticks = y.ticks(max(3, panel.height // UPRIGHT), panel.rows)
+    grid = "".join(f"M{x.start:g} {at:.1f}H{x.stop:g}" for at, _ in ticks)
+    grid += "".join(f"M{at:.1f} {top:g}V{bottom:g}" for at, _ in x_ticks)
+    labels = "".join(text(x.start - 4, at + 3.5, label, "e") for at, label in ticks)
+    drawn = "".join(_draw(layer, x, y) for layer in panel.layers)
+    names = _names(panel.names, x, y)
+    for label, value in levels.items():
+        at = y.pixels(value)
+        ends = f"M{x.start * SUBDIVISION:g} {SUBDIVISION * at:.0f}H{x.stop * SUBDIVISION:g}"
+        drawn += f'<path class="level" d="{ends}"/>'
+        names += text(x.stop - 2, at - 3, label, "e") if label else ""
+    middle = (top + bottom) / 2
+    return (
+        f'<g class="panel"{y.attribute(panel.label, panel.rows)}><path class="grid" d="{grid}"/>'
+        f'<g class="ticks">{labels}</g>'
+        f'<text class="m" transform="translate(10 {middle:g}) rotate(-90)">{escape(typeset(panel.label))}</text>'
+        f'<g class="layers" transform="scale({1 / SUBDIVISION:g})">{drawn}</g>{names}</g>'
+    )
+
+
+def _draw(layer: ChartLayer, x: Axis, y: Axis) -> str:
+    if isinstance(layer, Area):
+        whole = (SUBDIVISION * np.array([x.start, x.stop])).astype(np.int64)
+        at = whole if layer.x is None else x.units(layer.x)
+        low, high = (np.broadcast_to(end, len(at)) for end in (layer.low, layer.high))
+        path = _line(np.concatenate([at, at[::-1]]), y.units(np.concatenate([low, high[::-1]])))
+        return f'<path class="band c{layer.colour}" d="{path}z"/>'
+    if isinstance(layer, SampleMarks):
+        columns = enumerate(np.atleast_2d(layer.y.T), layer.colour)
+        return "".join(_samples(layer, column, f"c{colour}", x, y) for colour, column in columns)
+    known = np.flatnonzero(np.isfinite(layer.x) & np.isfinite(layer.y))
+    if isinstance(layer, LineMark):
+        breaks = np.flatnonzero(np.diff(known) > 1) + 1
+        ends = np.array([x.units(layer.x[known]), y.units(layer.y[known])])
+        path = "".join(_line(*piece) for piece in (np.split(ends, breaks, axis=1) if breaks.size else [ends]))
+        return f'<path class="line c{layer.colour} {layer.style}" d="{path}"/>'
+    at, path, room = x.units(layer.x[known]), "", LARGE_DOTS
+    if layer.low is not None and layer.high is not None:
+        low, high, room = y.units(layer.low[known]), y.units(layer.high[known]), LARGE_MEANS
+        path = f'<path class="strokes interval c{layer.colour}" d="{_path("M%d %dV%d", at, low, high)}"/>'
+    size = " large" * (len(layer.x) <= room)
+    units = f' data-units="{" ".join(str(layer.units[i]) for i in known)}"' if layer.units else ""
+    return f'{path}<path class="dots{size} c{layer.colour}" d="{_dots(at, y.units(layer.y[known]))}"{units}/>'
+
+
+def _samples(layer: SampleMarks, values: Values, colour: str, x: Axis, y: Axis) -> str:
+    """Return one column of samples as dots, or as the ranges of buckets."""
+    known = np.isfinite(layer.x) & np.isfinite(values)
+    known_x, known_y = layer.x[known], values[known]
+    if len(known_x) <= MAXIMUM_DOTS:
+        return f'<path class="dots {colour}" d="{_dots(x.units(known_x), y.units(known_y))}"/>'
+    start, count = _buckets(len(known_x), BUCKETS)
+    centre = x.units(np.add.reduceat(known_x, start) / count)
+    low, high = (y.units(end.reduceat(known_y, start)) for end in (np.minimum, np.maximum))
+    faint = " faint-strokes" * layer.mean
+    full = _full(layer.x, values, y)
+    out = f'<path class="strokes {colour}{faint}" d="{_path("M%d %dV%d", centre, low, high)}"{full}/>'
+    if layer.mean:
+        means = y.units(np.add.reduceat(known_y, start) / count)
+        out += f'<path class="line mean {colour}" d="{_line(centre, means)}"/>'
+    return out
+
+
+def _buckets(samples: int, most: int) -> tuple[Integers, Integers]:
+    """Return start and length of equal buckets; the last one also contains the remainder."""
+    size = -(-samples // most)
+    start = np.arange(0, samples // size * size, size)
+    return start, np.diff(np.append(start, samples))
+
+
+def _full(x: Values, values: Values, axis: Axis) -> str:
+    """Return all values of a curve as the attribute ``data-full``; of too many values, both ends of each bucket."""
+    if len(values) > MAXIMUM_FULL:
+        start, _ = _buckets(len(values), MAXIMUM_FULL // 2)
+        ends = (x[start], x[start]) if values is x else (end.reduceat(values, start) for end in (np.fmin, np.fmax))
+        values = np.stack([*ends], 1).ravel()
+    share = (np.clip(values, axis.low, axis.high) - axis.low) / (axis.high - axis.low)
+    numbers = np.where(np.isfinite(share), np.rint((2.0 * share - 1.0) * 32767.0), -32768.0).astype("<i2")
+    return f' data-full="{b64encode(numbers.tobytes()).decode()}"'
+
+
+def _line(x: Integers, y: Integers) -> str:
+    """Return the path through points, written as differences."""
+    if len(x) < 2:
+        return _dots(x, y)
+    if len(x) == 2:  # faster: a chart of rests has many of these
+        return f"M{x[0]} {y[0]}l{x[1] - x[0]} {y[1] - y[0]}"
+    return f"M{x[0]} {y[0]}l{_path(' %d %d', x[1:] - x[:-1], y[1:] - y[:-1])[1:]}"
+
+
+def _dots(x: Integers, y: Integers) -> str:
+    """Return a path of dots: lines of length zero, which are visible by their round ends."""
+    return f"M{x[0]} {y[0]}h0{_path('m%d %dh0', x[1:] - x[:-1], y[1:] - y[:-1])}" if len(x) else ""
+
+
+def _path(form: str, *columns: Integers) -> str:
+    """Return the form, filled once for each row of the columns."""
+    return form * len(columns[0]) % tuple(np.array(columns).T.ravel().tolist())
+
+
+def _names(points: Sequence[tuple[float, float, str]], x: Axis, y: Axis) -> str:
+    """Return the names of points, each 11 px high, without those that would overlap an earlier one."""
+    drawn: list[tuple[float, float, float]] = []
+    out = []
+    for px, py, name in points:
+        width, left, base = LETTER * len(name), x.pixels(px) + 6.0, y.pixels(py) - 5.0
+        left = left if left + width <= CHART_WIDTH - 2 else x.pixels(px) - 6.0 - width
+        if all(abs(base - b) > 11.0 or left > a + w or a > left + width for a, b, w in drawn):
+            drawn.append((left, base, width))
+            out.append(text(left, base, name, "b"))
+    return "".join(out)

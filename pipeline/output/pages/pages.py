@@ -1,0 +1,178 @@
+"""Load the templates of pages and texts. Values are escaped in HTML, but not in Markdown, plain text and YAML."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import cache
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from jinja2 import Environment, FileSystemLoader, Template, select_autoescape
+from markupsafe import Markup
+
+from pipeline.core.compiled_templates import CompiledTemplates
+from pipeline.estimation.candidates import is_fixed
+from pipeline.output.pages import numbers
+from pipeline.output.pages.numbers import Scale, measured, number, plain, unit_text
+from pipeline.core.verdicts import Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Container, Iterable, Mapping
+
+    from pipeline.core.files import JSON
+
+TEMPLATES = Path(__file__).parent / "templates"
+OF_NUMBERS = (
+    "aligned",
+    "in_unit",
+    "measured",
+    "number",
+    "percent",
+    "percent_change",
+    "probability",
+    "span",
+    "typeset",
+)  # filters
+PUBLISHED_DATA = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # in a campaign's page
+
+
+def _figure(value: object, scale: Scale | None = None) -> str:
+    """Return a number for a cell of a column with an SI prefix, empty for another value."""
+    return number(value / (scale.factor if scale else 1.0)) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        auto_reload=False,
+        bytecode_cache=CompiledTemplates("report"),
+        autoescape=select_autoescape(disabled_extensions=["md", "txt", "yaml"], default=True),
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {name: getattr(numbers, name) for name in OF_NUMBERS}
+    environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text}
+    environment.filters |= {"parameter_texts": parameter_texts, "details": stage_details, "monte_carlo": monte_carlo_of}
+    environment.filters |= {"script_data": script_data, "numeric": "#{}".format}
+    environment.globals |= {"asset": asset, "unit_link": unit_link, "Verdict": Verdict}
+    return environment
+
+
+def template(name: str) -> Template:
+    """Return a template by its file name."""
+    return _environment().get_template(name)
+
+
+def compile_templates() -> None:
+    """Compile all templates before processes are forked from this one."""
+    for file in (*TEMPLATES.glob("*.html"), *TEMPLATES.glob("*.txt")):
+        template(file.name)
+
+
+@cache
+def asset(name: str) -> Markup:
+    """Return a style sheet or script of the templates' folder."""
+    return Markup((TEMPLATES / name).read_text(encoding="utf-8"))  # noqa: S704  (our own file)
+
+
+def unit_link(unit: str, published: Container[str] | None) -> Markup:
+    """Return a unit's name with a link to its page if it is one of the ``published`` units; None: all have a page."""
+    address = f' href="reports/{quote(unit)}.html"' if published is None or unit in published else ""
+    return Markup(f"<a{address}>{escape(unit)}</a>")  # noqa: S704  (the name is escaped)
+
+
+def linked(page: str, units: Iterable[str]) -> str:
+    """Return a campaign's page with links to units whose pages were published later."""
+    for unit in units:
+        name, link = unit_link(unit, ()), unit_link(unit, None)
+        for without, with_link in ((name, link), (script_data(name)[1:-1], script_data(link)[1:-1])):
+            page = page.replace(str(without), str(with_link))
+    found = PUBLISHED_DATA.search(page)
+    if found:
+        names = [*json.loads(found[1]), *units]
+        page = page.replace(found[0], found[0].replace(found[1], script_data(sorted(set(names)))))
+    return page
+
+
+def script_data(value: object) -> Markup:
+    """Return a value as JSON for a script element; raises ``ValueError`` if a number is not finite."""
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    return Markup(text.replace("<", "\\u003c"))  # noqa: S704  (no tag can begin)
+
+
+def failure_page(unit: str, failure: Mapping[str, Any], *, calibrated: bool = False) -> str:
+    """Return a page for a unit whose page cannot be rendered; it needs no template and no results."""
+    where = f"{failure['file']}: " if failure["file"] else ""
+    address = quote(unit)
+    result = (
+        f'is calibrated (<a href="../calibrations/{address}.json">calibrations/{escape(unit)}.json</a>), but its page '
+        "and its calibration report could not be made"
+        if calibrated
+        else "has no result"
+    )
+    cause = escape(f"{where}{failure['message']}")
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(unit)}</title>'
+        '<meta name="viewport" content="width=device-width"><style>:root { color-scheme: light dark; } '
+        "body { font: 15px/1.5 sans-serif; margin: 24px; } pre { white-space: pre-wrap; }</style></head>\n"
+        f"<body><h1>{escape(unit)}</h1><p>This unit {result}: the stage {escape(failure['stage'])} failed "
+        f"({escape(failure['code'])}).</p><pre>{cause}</pre>\n"
+        '<p><a href="../index.html">The campaign</a></p></body></html>\n'
+    )
+
+
+def stage_details(stage: JSON) -> list[str]:
+    """Return the details of a stage of the fit that have one value, as texts."""
+    details = {k: v for k, v in (stage.get("details") or {}).items() if isinstance(v, int | float | str | bool)}
+    shown = {k: number(v, 4) if isinstance(v, float) else f"{v:,}" if type(v) is int else v for k, v in details.items()}
+    texts = {k: f"{plain(k)}: {text}" for k, text in shown.items()}
+    if details.get("samples_left_out"):
+        texts["samples_left_out"] += (
+            " (marked samples, and samples that the method does not use: outside of rests or steady turns, "
+            "or of a vague log)"
+        )
+    return list(texts.values())
+
+
+def parameter_texts(parameters: JSON | None, *, uncertain: bool = True) -> list[str]:
+    """Return ``name = value ± uncertainty unit`` for each parameter of an effect or a stage.
+
+    Where only a standard uncertainty is stated, twice its value is shown, which covers about 95 %.
+    """
+    texts = []
+    for name, given in (parameters or {}).items():
+        p = given if isinstance(given, dict) else {"value": given}
+        if is_fixed(name, p["value"], p.get("unit"), p.get("standard_uncertainty")):
+            texts.append(f"{name} fixed at 0")
+            continue
+        standard = p.get("standard_uncertainty")
+        expanded = p.get("expanded_uncertainty", 2.0 * standard if standard else None)
+        value = measured(p.get("value"), expanded if uncertain else None)
+        texts.append(f"{name} = {value} {unit_text(p.get('unit'))}".rstrip())
+    return texts
+
+
+def monte_carlo_of(budget: JSON) -> JSON | None:
+    """Return the result of the Monte Carlo run of an uncertainty budget for the page; None without a run.
+
+    ``finding``: a sentence; ``rows``: the index of each uncertain parameter.
+    """
+    run = budget.get("monte_carlo")
+    if not run:
+        return None
+    if not run["trials"]:
+        return {"finding": f"No Monte Carlo run: {run['reason']}.", "rows": []}
+    rows = [j for j, U in enumerate(run["expanded_uncertainty"]) if U > 0.0]
+    validated = sum(run["validated"][j] for j in rows)
+    digit = "second" if run["digits"] == 2 else "first"
+    finding = (
+        f"Monte Carlo, {run['trials']:,} trials: the interval of {validated} of {len(rows)} parameters agrees with the "
+        f"budget's to half a unit of the {digit} digit of u."
+    )
+    if validated < len(rows):
+        finding += " Where it does not, use the Monte Carlo interval."
+    return {"finding": finding, "rows": rows}

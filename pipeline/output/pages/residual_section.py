@@ -1,0 +1,310 @@
+"""Residuals of the fit, reading minus model, and their dependence on covariates.
+
+    e[n] = reading[n] - predicted[n],    predicted = bias + matrix^-1 truth + effects
+
+The prediction passes the filter of the readings, so that the lag of the filter causes no residual.
+
+Covariates: e is averaged in bins of angle, rate, force, temperature and time, with the standard error by white noise.
+The mean of ``(mean / standard error)^2`` is about 1 where e does not depend on the covariate; the charts are in the
+order of this mean.
+
+Harmonics of the turn: ``e = sum_k a_k cos kA + b_k sin kA`` over the angle A of the rate table, with the amplitude
+``sqrt(a_k^2 + b_k^2)``. Causes of 1 cycle a turn are misalignment, tilt and encoder; of 2 and 4 cycles quadratic
+nonlinearity and scale factor asymmetry; of 3 cycles cubic nonlinearity; of more cycles gears and steps of the table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.physics.kinematics import table_motion
+from pipeline.physics.measurement import predicted_reading
+from pipeline.core.records import AXES, MEDIAN_SIZE, SENSOR_UNITS, Integers, Motion, Recording, SensorCalibration, Values
+from pipeline.output.pages.chart import (
+    AXES_LEGEND,
+    Area,
+    ChartLayer,
+    Dots,
+    Figure,
+    LineMark,
+    Panel,
+    SampleMarks,
+    chart,
+    sentences,
+)
+from pipeline.output.pages.group_charts import stems
+from pipeline.output.pages.numbers import number
+from pipeline.physics.signal.encoder_rate import rate_by_angle
+from pipeline.physics.signal.filters import filtered
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pipeline.core.files import JSON
+    from pipeline.core.settings import Table
+
+RESIDUAL_BINS = 36  # of a covariate, and of a turn: 10 deg each
+MIN_BIN_SAMPLES = 5  # samples of a bin, below which it counts as empty: its scatter is unknown
+HARMONICS = 12  # cycles a turn; averaging over 36 bins reduces the amplitude of the last one by 16 %
+ONE_IN_A_THOUSAND = float(np.sqrt(2.0 * np.log(1000.0)))  # quantile 0.999 of the Rayleigh distribution
+FLAT = 2.0  # mean square of the means over noise and wander, below which the page calls them flat
+NOISE_ALONE_RATIO = 1.1  # residual over noise below which the page states that the residual is noise
+MODEL_POINTS = 150  # of a model's line: about the number of ranges in a chart
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Reading and prediction of one recording, (n, 3) in g or deg/s."""
+
+    recording: Recording
+    motion: Motion
+    reading: Values
+    predicted: Values
+    reference_noise: Values  # (3,), rms error of the rate by a coarse encoder, by axis
+
+    @cached_property
+    def error(self) -> Values:
+        """Reading minus prediction: (n, 3) array, g or deg/s."""
+        return self.reading - self.predicted
+
+
+def residuals(sensor: str, part: JSON, recordings: list[Recording], table: Table) -> list[Residual]:
+    """Return the residuals of the recordings for a sensor whose motion is known; ``part``: of its calibration."""
+    calibration = SensorCalibration.from_json(sensor, part)
+    out = []
+    for recording in recordings:
+        reading = recording.reading(sensor) if recording.role == sensor else None
+        motion = None if reading is None else table_motion(recording, table)
+        if reading is not None and motion is not None:
+            predicted = filtered(predicted_reading(calibration, motion), recording)
+            by_encoder = np.zeros(3)
+            by_angle = rate_by_angle(recording) if sensor == "gyroscope" else None
+            if by_angle is not None and motion.axis is not None:
+                by_encoder[motion.axis] = np.sqrt(np.mean(by_angle.noise**2))
+            out.append(Residual(recording, motion, reading, predicted, by_encoder))
+    return out
+
+
+def white_noise(residual: Residual, noise: JSON | None) -> Values:
+    """Return the standard deviation of a sample by white noise after the filter and by the reference: (3,) array.
+
+    Without a noise model it is ``1.4826 median |e[n+1] - e[n]| / sqrt(2)``, robust to slow errors and outliers.
+    """
+    if noise and noise.get("white"):
+        gain = float(residual.recording.filter.get("noise_gain", 1.0))
+        return np.asarray(np.hypot(gain * np.array(noise["white"], float), residual.reference_noise))
+    return np.asarray(MEDIAN_SIZE * np.median(np.abs(np.diff(residual.error, axis=0)), axis=0) / np.sqrt(2.0))
+
+
+@dataclass(frozen=True)
+class _BinnedMean:
+    """Means of a residual in bins of a covariate: centres (m,), means and standard errors (m, 3); NaN in empty bins."""
+
+    centre: Values
+    mean: Values
+    error: Values
+
+    def excess(self, wander: Values) -> float:
+        """Return the mean square of the means over the variance of noise and wander, of the worst axis.
+
+        ``wander``: standard deviations by axis.
+        """
+        filled = np.isfinite(self.mean[:, 0])
+        ratio = self.mean[filled] ** 2 / (self.error[filled] ** 2 + wander**2)
+        return float(ratio.mean(axis=0).max())
+
+
+def _binned_mean(covariate: Values, error: Values) -> _BinnedMean | None:
+    """Return the means of ``error`` (n, 3) in 36 equal bins of the covariate (n,); None where it does not vary."""
+    known = np.isfinite(covariate) & np.isfinite(error).all(axis=1)
+    if not known.all():
+        covariate, error = covariate[known], error[known]
+    low, high = (float(covariate.min()), float(covariate.max())) if len(covariate) else (0.0, 0.0)
+    if not high - low > 1e-9 * max(1.0, abs(low)):
+        return None
+    cell = np.minimum(((covariate - low) * (RESIDUAL_BINS / (high - low))).astype(np.int64), RESIDUAL_BINS - 1)
+    count = np.bincount(cell, minlength=RESIDUAL_BINS).astype(float)
+    count[count < MIN_BIN_SAMPLES] = np.nan
+    filled = np.isfinite(count)
+    if filled.sum() < 2:
+        return None
+    mean = np.stack([np.bincount(cell, e, RESIDUAL_BINS) / count for e in error.T], 1)
+    between = np.sum(mean[filled] ** 2 * count[filled, None], axis=0) / count[filled].sum()
+    scatter = np.sqrt(np.maximum(np.mean(error**2, axis=0) - between, 0.0)) + 1e-300
+    centre = low + (np.arange(RESIDUAL_BINS) + 0.5) * (high - low) / RESIDUAL_BINS
+    return _BinnedMean(centre, mean, scatter / np.sqrt(count)[:, None])
+
+
+COVARIATES: dict[str, Callable[[Residual], Values | None]] = {
+    "angle, deg": lambda r: None if r.motion.angle is None else np.mod(r.motion.angle, 360.0),
+    "rate, deg/s": lambda r: r.motion.rate,
+    "specific force x, g": lambda r: r.motion.specific_force[:, 0],
+    "specific force y, g": lambda r: r.motion.specific_force[:, 1],
+    "specific force z, g": lambda r: r.motion.specific_force[:, 2],
+    "temperature, degC": lambda r: r.motion.temperature,
+    "time, s": lambda r: r.motion.time if r.recording.clock_shared else r.motion.time - r.motion.time[0],
+}
+
+
+def covariates(found: list[Residual], wander: Values) -> dict[str, _BinnedMean]:
+    """Return binned means over all recordings by covariate, the largest excess first.
+
+    Of the components of the specific force only the one with the largest excess is returned.
+    """
+    out: dict[str, _BinnedMean] = {}
+    for label, value in COVARIATES.items():
+        pairs = [(v, r.error) for r in found if (v := value(r)) is not None]
+        if pairs:
+            binned = _binned_mean(np.concatenate([v for v, _ in pairs]), np.concatenate([e for _, e in pairs]))
+            out |= {label: binned} if binned else {}
+    order = sorted(out, key=lambda label: -out[label].excess(wander))
+    forces = [label for label in order if label.startswith("specific force")]
+    return {label: out[label] for label in order if label not in forces[1:]}
+
+
+def _angle_bins(angle: Values) -> tuple[Integers, Integers]:
+    """Return the bin, of 36 in a turn, of each of (n,) angles (deg), and the number of angles in each bin."""
+    cell = (np.mod(angle, 360.0) * (RESIDUAL_BINS / 360.0)).astype(np.int64) % RESIDUAL_BINS
+    return cell, np.bincount(cell, minlength=RESIDUAL_BINS)
+
+
+def harmonics(residual: Residual) -> Values | None:
+    """Return the amplitudes of 0 to 12 cycles a turn: (13, 3) array, None where a bin of the turn has no sample.
+
+    They are computed from means in 36 bins of the angle; the division by ``sinc`` corrects for averaging over a bin.
+    """
+    angle = residual.motion.angle
+    if angle is None:
+        return None
+    cell, count = _angle_bins(angle)
+    if not count.all():
+        return None
+    mean = np.stack([np.bincount(cell, e, RESIDUAL_BINS) / count for e in residual.error.T], 1)
+    amplitude = np.abs(np.fft.rfft(mean, axis=0))[: HARMONICS + 1] * (2.0 / RESIDUAL_BINS)
+    amplitude[0] /= 2.0
+    return np.asarray(amplitude / np.sinc(np.arange(HARMONICS + 1) / RESIDUAL_BINS)[:, None])
+
+
+def harmonic_noise(residual: Residual, white: Values, wander: Values, time: float) -> Values:
+    """Return the amplitude that noise alone exceeds with a probability of 0.001, by cycles a turn: (13,) array.
+
+    The mean of ``a^2 + b^2`` of a harmonic is ``2 (2 white^2 / n + 2 S(f) / D)`` with the two-sided spectrum of the
+    wander ``S = 2 s^2 T / (1 + (2 pi f T)^2)``, the recorded time D and the effective number of samples n, where
+    ``1 / n`` is the mean of ``1 / (36 n_bin)``. ``white, wander``: (3,) standard deviations, the largest one is used;
+    ``time``: correlation time of the wander, s.
+    """
+    motion = residual.motion
+    assert motion.angle is not None  # noqa: S101
+    duration = max(float(np.ptp(motion.time)), 1e-9)
+    turns = max(float(np.abs(np.diff(motion.angle)).sum()) / 360.0, 1.0)
+    frequency = np.arange(HARMONICS + 1) * turns / duration
+    spectrum = 2.0 * float(wander.max()) ** 2 * time / (1.0 + (2.0 * np.pi * frequency * time) ** 2)
+    of_white = (
+        float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(_angle_bins(motion.angle)[1], 1))) / RESIDUAL_BINS
+    )
+    spread = np.sqrt(2.0 * of_white + 2.0 * spectrum / duration)
+    spread[0] = np.hypot(np.sqrt(of_white), wander.max())  # a mean, not an amplitude
+    return np.asarray(ONE_IN_A_THOUSAND * spread)
+
+
+def residual_figures(sensor: str, found: list[Residual], noise: JSON | None) -> list[Figure]:
+    """Draw binned means of the residuals against each covariate (worst first), and their harmonics of the turn."""
+    wander = np.array((noise or {}).get("wander") or [0.0] * 3, float)
+    time = float((noise or {}).get("correlation_time_s") or 100.0)
+    figures = [_covariate(sensor, label, mean, wander) for label, mean in covariates(found, wander).items()]
+    for residual in found:
+        amplitudes = harmonics(residual)
+        if amplitudes is not None:
+            level = harmonic_noise(residual, white_noise(residual, noise), wander, time)
+            figures.append(_harmonics(sensor, residual.recording.name, amplitudes, level))
+    return figures
+
+
+def _covariate(sensor: str, label: str, mean: _BinnedMean, wander: Values) -> Figure:
+    """Draw the binned means of each axis with the band of the wander."""
+    unit, (name, covariate_unit) = SENSOR_UNITS[sensor], label.split(", ")
+    words, excess = name.replace("force ", "force along "), mean.excess(wander)
+    top = 1.05 * max(float(np.nanmax(np.abs(mean.mean) + 2 * mean.error)), 2.2 * float(wander.max()))
+    panels = []
+    for i, axis in enumerate(AXES):
+        m, U = mean.mean[:, i], 2 * mean.error[:, i]
+        layers: list[ChartLayer] = [Area(-2 * wander[i], 2 * wander[i])] if wander[i] > 0 else []
+        layers.append(Dots(mean.centre, m, i, m - U, m + U))
+        panels.append(Panel(layers, f"{axis}, {unit}", height=64, levels={"": 0.0}, limits=(-top, top)))
+    finding = f"Flat against {words}, within the noise"
+    if excess >= FLAT:
+        spread = np.abs(mean.mean) / np.sqrt(mean.error**2 + wander**2)
+        row, worst = np.unravel_index(int(np.nanargmax(spread)), spread.shape)
+        at, size, sigmas = (float(v) for v in (mean.centre[row], mean.mean[row, worst], spread[row, worst]))
+        finding = (
+            f"Not flat against {words}: {number(size)} {unit} on {AXES[worst]} at {number(at)} {covariate_unit}, "
+            f"{number(sigmas, 2)} σ"
+        )
+    return chart(
+        Figure(f"{sensor}-residual-{name.replace(' ', '-')}", finding, quiet=excess < FLAT),
+        f"Means in bins; on the worst axis their mean square is {number(excess)} times that of noise and wander.",
+        panels,
+        label,
+        kind="angle" if name == "angle" else "",
+    )
+
+
+def _harmonics(sensor: str, name: str, amplitudes: Values, level: Values) -> Figure:
+    """Draw the amplitudes by cycles a turn, with the level of the noise."""
+    unit = SENSOR_UNITS[sensor]
+    ratio = amplitudes / np.maximum(level[:, None], 1e-300)
+    ratio[0] = 0.0  # a bias
+    cycles, axis = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+    significant = bool(ratio.max() > 1.0)
+    finding = f"{name}: no harmonic of the turn above the noise"
+    if significant:
+        size, plural = number(float(amplitudes[cycles, axis]), 2), "s" if cycles != 1 else ""
+        finding = f"{name}: {cycles} cycle{plural} a turn on {AXES[axis]}, {size} {unit}, above the noise"
+    figure = Figure(f"{sensor}-harmonics-{name}", finding, legend=AXES_LEGEND, quiet=not significant)
+    groups = {str(k): row for k, row in enumerate(amplitudes.tolist())}
+    return stems(figure, groups, f"amplitude, {unit}", "cycles a turn", level.tolist())
+
+
+def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -> Figure:
+    """Draw readings and model over a turn, and below them the residual of each axis with the band of +-2 sigma.
+
+    Without a noise model, sigma follows from the scatter of the residual.
+    """
+    unit, motion, name = SENSOR_UNITS[sensor], residual.motion, residual.recording.name
+    turns = motion.angle is not None and np.ptp(motion.angle) > 1.0
+    x = motion.angle if turns and motion.angle is not None else motion.time
+    known = bool(noise and noise.get("white"))
+    sigma = np.hypot(white_noise(residual, noise), ((noise or {}).get("wander") or 0.0) if known else 0.0)
+    every = slice(None, None, -(-len(x) // MODEL_POINTS))  # of the model, which has no noise, few points are enough
+    layers: list[ChartLayer] = [SampleMarks(x, residual.reading)]
+    layers += [LineMark(x[every], residual.predicted[every, i], 5, "model") for i in range(3)]
+    top = max(float(np.abs(residual.error).max()), 2.2 * float(sigma.max()))
+    panels = [Panel(layers, f"reading, {unit}")]
+    for i, axis in enumerate(AXES):
+        layers = [Area(-2 * sigma[i], 2 * sigma[i]), SampleMarks(x, residual.error[:, i], i, mean=True)]
+        panels.append(Panel(layers, f"{axis}, {unit}", height=56, limits=(-top, top)))
+    rms = np.sqrt(np.mean(residual.error**2, axis=0))
+    ratio, outside = float((rms / sigma).max()), float(np.mean(np.abs(residual.error) > 2 * sigma))
+    by_encoder = float(residual.reference_noise.max())
+    finding, caption, description = sentences(
+        "model",
+        name=name,
+        ratio=ratio,
+        outside=outside,
+        reference=(AXES[int(np.argmax(residual.reference_noise))], by_encoder) if known and by_encoder else None,
+        known=known,
+        rms=rms.tolist(),
+        unit=unit,
+        noise=NOISE_ALONE_RATIO,
+    )
+    return chart(
+        Figure(f"{sensor}-{name}", finding, caption, (*AXES_LEGEND, ("c5", "model"))),
+        description,
+        panels,
+        "angle of the rate table, deg" if turns else "time, s",
+        kind="angle" if turns else "",
+    )

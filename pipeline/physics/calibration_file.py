@@ -1,0 +1,473 @@
+"""Read and check ``calibrations/<unit>.json``; find implausible parameters in it.
+
+The file may have been edited, truncated, or written by another version. Every fault is an ``InputError`` that names
+the file, the key, its value and what was expected.
+
+A parameter far outside the limits of the sensor model nearly always means another range, unit or column. With
+
+    reading = bias + K truth + ...,    K = matrix^-1 = P R
+
+where
+
+    P : (3, 3) symmetric, ``(K K^T)^(1/2)``: scale factors on its diagonal, cross-axis sensitivities off it
+    R : (3, 3) rotation, of the unit against the table or its case: no property of the sensor
+
+A parameter p with the expanded uncertainty U and the sensor file's limit L is implausible where
+
+    |p| - 2 U > max(4 L, F)
+
+and beyond the sensor file's limit where ``|p| > L``: one list, ``beyond_limits``, which the run stores and all pages,
+the summary, the certificate and the terminal show.
+
+A data sheet states L as a bound, or as one standard deviation. Four of these are exceeded by a good sensor's 12
+parameters in 12 * 6.3e-5 = 0.08 % of units; 2 U are four standard uncertainties. F is what a low-cost sensor is allowed
+(MPU-6000/6050 product specification 3.4, relative to its range): the sheet of a better one holds for its own mounting
+and its own bench, and the STIM300 of the founding thesis departs from its sheet by 17 L in bias and 10 L in scale
+factor.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+
+from imu_logs.files import not_regular
+from pipeline.core.errors import ConfigurationError, InputError, MissingInputError, shortened
+from pipeline.physics.checked import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
+from pipeline.physics.effects import effect_of
+from pipeline.physics.effects.base import parameter_limits
+from pipeline.physics.open_effects import OF_BUDGET, open_words
+from pipeline.core.pack import read_published
+from pipeline.core.records import (
+    AXES,
+    BIAS_NAMES,
+    LIMIT,
+    READABLE_VERSIONS,
+    SENSOR_UNITS,
+    SENSORS,
+    FittedEffect,
+    SensorCalibration,
+    Values,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from pipeline.physics.checked import Check
+    from pipeline.core.settings import DataSheet
+
+# Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
+# (2 to 32 g), 32 between those of a gyroscope (125 to 4000 deg/s), 57 for rad/s, 1000 for mg and mdps.
+LARGEST_FACTOR = 1000.0
+# Two axes 1 deg apart have a condition of 2 / sin(1 deg) = 115; a sensor's axes are 90 deg apart within some degrees.
+LARGEST_CONDITION = 100.0
+
+# estimators average over longer times, between two images or scans: a faster process counts as white
+MIN_EXPORTED_TIME_S = 0.1
+WHAT_TO_DO = "take the file as the run published it, or calibrate the unit anew"
+LEFT_OUT_REASONS = {
+    "N-STUCK": "stuck",
+    "N-CLIP": "clipped",
+    "N-DISTURBED": "glitches or knocks",
+    "N-SHAKEN": "shaken at rest",
+    "N-MOVED": "moving",
+}  # notes on rows that no fit uses, and the reason
+
+_VECTOR = items(number, 3)
+_EFFECT = fields(
+    {
+        "name": text,
+        "parameters": each(fields({"value": number, "unit": or_none(text)}, ("value",), others=True)),
+        "definition": or_none(mapping),
+    },
+    ("name", "parameters"),
+)
+_COVARIANCE = fields(
+    {"parameters": items(text), "values": items(items(or_none(number)))}, ("parameters", "values"), others=True
+)
+_STAGE = fields(
+    {
+        "name": text,
+        "parameters": mapping,
+        "residual_rms": or_none(number),
+        "correction": or_none(mapping),
+        "details": mapping,
+    },
+    ("name", "parameters"),
+)
+
+
+def _sensor(unit: str) -> Check:
+    required = {
+        "unit": one_of(unit),
+        "bias": _VECTOR,
+        "matrix": items(_VECTOR, 3),
+        "covariance": _COVARIANCE,
+        "effects": items(_EFFECT),
+        "stages": items(_STAGE),
+        "converged": flag,
+        "degrees_of_freedom": or_none(number),
+    }
+    optional = {"effective_degrees_of_freedom": or_none(items(or_none(number)))}
+    return fields({**required, **optional}, required, others=True)
+
+
+_TEMPERATURES = dict.fromkeys(("temperature_degc", "soaked_degc"), items(number, 2))
+_RANGE = fields({"specific_force_g": number, "angular_rate_dps": number, **_TEMPERATURES}, ())
+_DOCUMENT = fields(
+    {
+        "status": one_of("ok"),
+        "calibrated_range": _RANGE,
+        **{sensor: or_none(_sensor(unit)) for sensor, unit in SENSOR_UNITS.items()},
+    },
+    ("status", *SENSORS),
+    others=True,
+)
+
+
+def read_calibration(file: Path) -> dict[str, Any]:
+    """Return the document of a calibrated unit.
+
+    Raises ``MissingInputError`` if the file does not exist, ``InputError`` if it cannot be read, belongs to another
+    schema version or to a failed unit, holds no calibrated sensor, or a value is not what is expected.
+    """
+    try:
+        if file.exists() and (other := not_regular(file)):
+            _refuse(file, f"this {other}")
+        document = json.loads(
+            read_published(file).decode(), object_pairs_hook=_without_repeats, parse_constant=_not_finite
+        )
+    except FileNotFoundError:
+        raise MissingInputError("there is no such calibration", str(file)) from None
+    except (OSError, RecursionError, ValueError) as error:  # ValueError: no UTF-8, no JSON, or refused below
+        if file.suffix.lower() != ".json":
+            _refuse(file, f"this is no calibration of a unit: make one of it by convert {file} calibration.json")
+        _refuse(file, f"this is no calibration of a unit: {error}; {WHAT_TO_DO}")
+    if not isinstance(document, dict) or "status" not in document:
+        _refuse(file, "this is no calibration of a unit: it has no status; expected calibrations/<unit>.json")
+    version = document.get("schema_version")
+    if version not in READABLE_VERSIONS or isinstance(version, bool):
+        shown = "missing" if version is None else repr(version)
+        readable = " and ".join(map(str, READABLE_VERSIONS))
+        _refuse(file, f"schema_version is {shown}; this version reads {readable}: calibrate the unit anew")
+    if document["status"] == "failed":
+        error_entry = document.get("error")
+        cause = error_entry.get("message", "unknown") if isinstance(error_entry, dict) else "unknown"
+        _refuse(file, f"unit {document.get('unit')} failed and has no calibration; cause: {cause}")
+    try:
+        _DOCUMENT(document)
+    except WrongValueError as wrong:
+        _refuse(file, f"{wrong}; {WHAT_TO_DO}")
+    if all(document[sensor] is None for sensor in SENSORS):
+        reasons = document.get("not_calibrated")
+        cause = "; ".join(map(str, reasons.values())) if isinstance(reasons, dict) and reasons else "not stated"
+        _refuse(file, f"accelerometer and gyroscope are null: there is nothing to apply; reason: {cause}")
+    return document
+
+
+def sensor_of(document: dict[str, Any], sensor: str, file: Path) -> SensorCalibration | None:
+    """Return the calibration of one sensor of ``read_calibration``; None where it is not calibrated.
+
+    Raises ``InputError`` if matrix, covariance or an effect is invalid, ``ConfigurationError`` if an effect is unknown.
+    """
+    part = document[sensor]
+    if part is None:
+        return None
+    _check_matrix(file, f"{sensor}.matrix", np.array(part["matrix"], float))
+    size, rows = len(part["covariance"]["parameters"]), part["covariance"]["values"]
+    if [len(row) for row in rows] != [size] * size:
+        _refuse(file, f"{sensor}.covariance.values is not {size} x {size}, as its parameters say")
+    names = [entry["name"] for entry in part["effects"]]
+    for i, entry in enumerate(part["effects"]):
+        if entry["name"] in names[:i]:
+            _refuse(file, f"{sensor}.effects[{i}] is {entry['name']} a second time; expected each effect once")
+        _check_effect(file, f"{sensor}.effects[{i}]", sensor, entry)
+    return SensorCalibration.from_json(sensor, part)
+
+
+def sample_covariance(document: Mapping[str, Any], sensor: str) -> Values | None:
+    """Return the covariance of a calibrated sample: (3, 3) array, g^2 or (deg/s)^2.
+
+        cov = M diag(N^2 / dt + 2 Q^2 / dt^2 + sum_i G_i^2) M^T
+
+    with the white and quantisation noise N and Q of an axis at rest, identified at the sampling interval dt, and the
+    standard deviation G_i of its Gauss-Markov processes with a correlation time of less than ``MIN_EXPORTED_TIME_S``. A
+    slower bias wander is not noise of a single sample. None where the sensor is not calibrated, or the noise of an axis
+    is unknown.
+    """
+    noise, part = (document.get("noise") or {}).get(sensor) or {}, document.get(sensor)
+    axes = noise.get("axes") or {}
+    if not part or any((axes.get(axis) or {}).get("terms") is None for axis in AXES):
+        return None
+    dt, variances = float(noise["sampling_interval_s"]), []
+    for axis in AXES:
+        terms = axes[axis]["terms"]
+        white, quantisation = (terms[name]["value"] or 0.0 for name in ("white", "quantisation"))
+        fast = [g["value"] for g in terms["gauss_markov"] if g["correlation_time_s"]["value"] < MIN_EXPORTED_TIME_S]
+        variances.append(white**2 / dt + 2.0 * quantisation**2 / dt**2 + sum(g**2 for g in fast))
+    spread = np.array(part["matrix"], np.float64) * np.sqrt(variances)
+    return np.asarray(spread @ spread.T)
+
+
+def _check_matrix(file: Path, key: str, matrix: np.ndarray) -> None:
+    sizes = np.linalg.svd(matrix, compute_uv=False)
+    if sizes[2] * LARGEST_CONDITION < sizes[0]:
+        _refuse(file, f"{key} is singular or nearly so: singular values {sizes[0]:.3g} to {sizes[2]:.3g}; expected "
+                      f"a ratio below {LARGEST_CONDITION:g}")  # fmt: skip
+    if sizes[0] > LARGEST_FACTOR or sizes[2] * LARGEST_FACTOR < 1.0:
+        _refuse(
+            file,
+            f"{key} multiplies readings by {sizes[2]:.3g} to {sizes[0]:.3g}; expected about 1, and between "
+            f"{1 / LARGEST_FACTOR:g} and {LARGEST_FACTOR:g} even for readings in another unit or range",
+        )
+
+
+def _check_effect(file: Path, where: str, sensor: str, entry: dict[str, Any]) -> None:
+    name, parameters = entry["name"], entry["parameters"]
+    try:
+        effect = effect_of(FittedEffect(name, parameters, entry.get("definition")))
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{where}: {error.message}", str(file)) from None
+    known = effect.parameters(sensor) if sensor in effect.sensors else ()
+    if list(parameters) != [p.name for p in known]:
+        listed = ", ".join(p.name for p in known) or f"none: it is no effect of the {sensor}"
+        _refuse(file, f"{where}.parameters ({name}) are {', '.join(parameters) or 'none'}; expected {listed}")
+    for p in known:
+        stated = parameters[p.name].get("unit")
+        if stated not in {"", p.unit}:  # empty: not stated
+            _refuse(file, f"{where}.parameters.{p.name}.unit ({name}) is {stated!r}; expected {p.unit!r}")
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f'the key "{twice}" stands twice in one object; expected each key once')
+    return found
+
+
+def _not_finite(name: str) -> NoReturn:
+    raise ValueError(f"it holds the number {name}; expected finite numbers")
+
+
+def _refuse(file: Path, message: str) -> NoReturn:
+    raise InputError(message, str(file))
+
+
+MULTIPLE = 4.0  # see above
+LOW_COST_BIAS = {"accelerometer": 0.08 / 2.0, "gyroscope": 20.0 / 250.0}  # share of the range, see above
+LOW_COST_SCALE, LOW_COST_CROSS = 0.03, 0.02  # see above
+EQUAL_SPREAD = 0.1  # relative spread of the three scale factors that have one cause
+FACTOR_DISTANCE = 0.03  # relative distance from a factor by which it is recognised, as a low-cost scale factor's limit
+MISTAKEN_FACTORS = {
+    "accelerometer": {
+        9.80665: "in m/s^2, and read as g",
+        1000.0: "in mg, and read as g",
+        1.0 / 9.80665: "in g, and read as m/s^2",
+    },
+    "gyroscope": {
+        np.pi / 180.0: "in rad/s, and read as deg/s",
+        180.0 / np.pi: "in deg/s, and read as rad/s",
+        1000.0: "in mdeg/s, and read as deg/s",
+        1.0 / 6.0: "in revolutions a minute, and read as deg/s",
+    },
+}
+NAMED_PARAMETERS = 5  # parameters beyond the limits that a line names
+RANGE_RATIOS = [2.0**n for n in range(-6, 7) if n]  # ratios of the ranges of one sensor: neighbours differ by two
+CAUSES_OF_BIAS = "an offset of raw counts that is not subtracted, another column, or a damaged axis"
+OF_CROSS_AXIS = "another column or axis map, or a unit that moved on the table between recordings"
+OF_FRAME = "the direction of the case"
+NO_FRAME = "how it lies in the body frame of turn axes, faces and zeros is not stated (table.seat_deg, procedure.faces)"
+OF_EFFECT = "another effect that looks alike, or an error of the table, its log or the time stamps"
+
+Entry = dict[str, Any]
+LimitRow = tuple[
+    str, float, float, str, float, float, str
+]  # name, value, uncertainty, unit, limit, floor, likely cause
+
+
+def implausible(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[Entry]:
+    """Return the fitted parameters of a sensor that are beyond the sensor file's limits, the largest ratio first.
+
+    ``part`` is the sensor's part of ``calibrations/<unit>.json``, ``data_sheet`` the figures of the sensor. An
+    entry has ``parameter``, ``value``, ``unit``, ``limit`` of the sensor file, ``ratio`` of the two and
+    ``likely_cause``.
+    """
+    entries = [
+        _entry(row) | {"likely_cause": row[-1]}
+        for row in _limited(sensor, part, data_sheet)
+        if abs(row[1]) - 2.0 * row[2] > max(MULTIPLE * row[4], row[5])
+    ]
+    return sorted(entries, key=lambda entry: -entry["ratio"])
+
+
+def beyond_limits(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[Entry]:
+    """Return the fitted parameters whose absolute value exceeds the sensor file's limit, the largest ratio first.
+
+    Parameters as of ``implausible``; an entry has ``parameter``, ``value``, ``unit``, ``limit`` and ``ratio``.
+    """
+    entries = [_entry(row) for row in _limited(sensor, part, data_sheet) if abs(row[1]) > row[4]]
+    return sorted(entries, key=lambda entry: -entry["ratio"])
+
+
+def beyond_words(part: Mapping[str, Any] | None) -> str:
+    """Return the entries of ``beyond_limits`` in a calibration in words: ``bias y (250 %), ...``; empty for none."""
+    entries = (part or {}).get("beyond_limits") or []
+    return ", ".join(shortened([f"{_plain(e)} ({100.0 * e['ratio']:.3g} %)" for e in entries], NAMED_PARAMETERS))
+
+
+def _entry(row: LimitRow) -> Entry:
+    name, value, _, unit, limit, *_ = row
+    return {"parameter": name, "value": value, "unit": unit, "limit": limit, "ratio": abs(value) / limit}
+
+
+def _limited(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> Iterator[LimitRow]:
+    """Yield the rows of all parameters that the sensor file limits."""
+    yield from _of_bias_and_matrix(sensor, part, data_sheet)
+    yield from limited_effects(sensor, part, data_sheet.effects)
+
+
+def without_rotation(matrix: Values) -> Values:
+    """Return P of ``matrix^-1 = P R``: (3, 3) symmetric array."""
+    K = np.linalg.inv(matrix)
+    squares, axes = np.linalg.eigh(K @ K.T)
+    return np.asarray((axes * np.sqrt(squares)) @ axes.T)
+
+
+def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> Iterator[LimitRow]:
+    """Yield the rows of biases, scale factors and cross-axis sensitivities."""
+    K, P = np.linalg.inv(np.array(part["matrix"], float)), without_rotation(np.array(part["matrix"], float))
+    spread = part["expanded_uncertainty"]
+    of_matrix = np.abs(K) @ np.array(spread["matrix"], float) @ np.abs(K)  # dK = -K dM K
+    floor, unit = LOW_COST_BIAS[sensor] * data_sheet.full_scale, SENSOR_UNITS[sensor]
+    for name, value, uncertainty in zip(BIAS_NAMES, part["bias"], spread["bias"], strict=True):
+        yield name, float(value), float(uncertainty), unit, data_sheet.bias, floor, CAUSES_OF_BIAS
+    scale, limit = _scale_cause(sensor, np.diag(P)), data_sheet.scale_factor
+    for i, a in enumerate(AXES):
+        yield f"scale_factor_{a}", float(P[i, i] - 1.0), float(of_matrix[i, i]), "1", limit, LOW_COST_SCALE, scale
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        name, limit = f"cross_axis_{AXES[i]}{AXES[j]}", data_sheet.cross_axis
+        yield name, float(P[i, j]), float(of_matrix[i, j]), "1", limit, LOW_COST_CROSS, OF_CROSS_AXIS
+
+
+def limited_effects(sensor: str, part: Mapping[str, Any], limits: Mapping[str, float]) -> Iterator[LimitRow]:
+    """Yield the rows of the effects' parameters that have an uncertainty and a limit; ``limits``: of the effects."""
+    for entry in part.get("effects") or []:
+        try:
+            effect = effect_of(FittedEffect(entry["name"], entry["parameters"], entry.get("definition")))
+        except ConfigurationError:
+            continue  # an effect in Python that is not loaded here: its limits are unknown
+        sizes = parameter_limits(effect, sensor, limits)
+        for (symbol, p), limit in zip(entry["parameters"].items(), sizes, strict=True):
+            spread = p.get("expanded_uncertainty")
+            if np.isfinite(limit) and spread is not None:
+                name, value = f"{entry['name']}.{symbol}", float(p["value"])
+                yield name, value, float(spread), p["unit"], float(limit), 0.0, OF_EFFECT
+
+
+def _scale_cause(sensor: str, factors: np.ndarray) -> str:
+    """Return the likely cause of scale factors far from 1."""
+    mean = float(np.mean(factors))
+    if np.ptp(factors) > EQUAL_SPREAD * mean:
+        return "another column, counts per unit or axis map of this axis, or a damaged axis"
+    unit = next((u for f, u in MISTAKEN_FACTORS[sensor].items() if abs(mean / f - 1.0) < FACTOR_DISTANCE), None)
+    if unit is not None:
+        return f"readings {mean:.4g} times the truth: they are {unit}; set the unit of their columns in ingest"
+    setting = f"set sensor.{sensor}.full_scale and counts_per_unit"
+    if any(abs(mean / f - 1.0) < FACTOR_DISTANCE for f in RANGE_RATIOS):
+        return f"readings {mean:.4g} times the truth: the sensor was set to another range; {setting}"
+    return f"readings {mean:.4g} times the truth: the sensor was probably set to another range or unit; {setting}"
+
+
+def sentences(sensor: str, part: Mapping[str, Any] | None) -> list[str]:
+    """Return a sentence for each cause of implausible parameters; ``part``: of ``calibrations/<unit>.json``."""
+    by_cause: dict[str, list[Entry]] = {}
+    for entry in (part or {}).get("implausible") or []:
+        by_cause.setdefault(entry["likely_cause"], []).append(entry)
+    found = []
+    for cause, entries in by_cause.items():
+        worst = max(entries, key=lambda e: e["ratio"])
+        names = ", ".join(map(_plain, entries))
+        unit = "" if worst["unit"] == "1" else f" {worst['unit']}"
+        found.append(
+            f"Implausible for this model of {sensor}: {names}; {_plain(worst)} is {worst['value']:+.4g}{unit}, "
+            f"{worst['ratio']:.3g} times the sensor file's limit of {worst['limit']:.4g}{unit}. Likely cause: {cause}. "
+            f"Where it is meant so: sensor.{sensor}.accept_implausible=true."
+        )
+    return found
+
+
+def _plain(entry: Entry) -> str:
+    """Return the name of an entry's parameter in words: ``g sensitivity kg xx`` for ``g_sensitivity.kg_xx``."""
+    return str(entry["parameter"]).replace(".", " ").replace("_", " ")
+
+
+def beyond_uncertainty(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """Return the error sources that are not in the expanded uncertainty U of a sensor and can exceed U.
+
+    Each entry is the source with its size, and the reason why U does not include it. A relative error of the matrix
+    changes the scale factors most, so that it is compared with their U. ``part``: of ``calibrations/<unit>.json``.
+    """
+    found, left_open = [], open_words(part)
+    part = part or {}
+    listed = {entry["effect"] for entry in part.get("open") or []} if left_open else set()
+    for entry in (part.get("uncertainty_budget") or {}).get("not_included", []):
+        if OF_BUDGET.get(entry["source"]) in listed:
+            continue
+        for key, size in entry.get("up_to", {}).items():
+            U = part["expanded_uncertainty"][key]
+            if size > max(u or 0.0 for u in (U if key == "bias" else np.diag(U))):
+                of = f"{size:.2g} {part['unit']} of bias" if key == "bias" else f"{100.0 * size:.2g} % of the matrix"
+                found.append((f"{entry['source']}, up to {of}", entry["reason"].partition("; up to ")[0]))
+    if part.get("frame_deg", ()) is None:
+        found.append((OF_FRAME, NO_FRAME))
+    return found + left_open
+
+
+def frame_words(part: Mapping[str, Any] | None) -> str:
+    """Return how well the body frame of a sensor is known against the case; empty where nothing is stated."""
+    frame = (part or {}).get("frame_deg")
+    sizes = frame and ", ".join(f"{u:.2g}" for u in frame)
+    return f"The body frame is known against the case to {sizes} deg about x, y, z (95 %)" if sizes else ""
+
+
+def not_determined(part: Mapping[str, Any]) -> str:
+    """Return which parameters the recordings do not determine, and which would; empty if all are determined."""
+    lines = (part.get("uncertainty_budget") or {}).get("contributions") or []
+    names = next((str(line["remark"]) for line in lines if line["source"] == LIMIT), "")
+    if not names:
+        return ""
+    advice = "rest the unit in more attitudes, also half-way between two axes"
+    if "bias_" in names or "scale_factor_" in names:
+        advice = "rest the unit in more attitudes, each axis up and down, also half-way between two axes"
+    if "matrix_" in names:
+        about = [axis for axis in "xyz" if f"matrix_{axis}{axis}" in names]
+        turns = f"turn the unit about {' and '.join(about)} by a known angle, " if about else ""
+        advice = f"{turns}move it between rests in many attitudes, or state the axes of turns more accurately"
+    return f"the rests do not determine {names}, known by the limit of the sensor file alone: {advice}"
+
+
+def left_out(inputs: Sequence[Mapping[str, Any]] | None) -> list[str]:
+    """Describe the rows of each recording that no fit uses: ``404 of 18,247 rows of gyro_z (3.2 s stuck)``.
+
+    ``inputs``: as in ``calibrations/<unit>.json``. Missing time is stated as a share of the duration.
+    """
+    found = []
+    for entry in inputs or []:
+        name, rate, rows = entry.get("recording") or entry.get("file"), entry.get("rate_hz"), entry.get("rows")
+        counts: dict[str, list[int]] = {}
+        if missing := entry.get("missing_s"):
+            found.append(f"{name}: {missing / entry['duration_s']:.3%} of the time is missing")
+        for note in entry.get("notes") or []:
+            if note["code"] in LEFT_OUT_REASONS:
+                counts.setdefault(note["code"], []).append(note["count"])
+        for code, each_note in counts.items():
+            several = code == "N-CLIP" and len(each_note) > 1  # a note for each channel, some for the same rows
+            count = max(each_note) if several else sum(each_note)
+            share = f"{'at least ' * several}{count:,}{f' of {rows:,}' if rows else ''} rows of {name}"
+            found.append(f"{share} ({f'{count / rate:.2g} s ' if rate else ''}{LEFT_OUT_REASONS[code]})")
+    return found

@@ -1,0 +1,267 @@
+"""Compensate arrays, logs and streams by the calibration of a unit.
+
+    truth = matrix @ (reading - bias - sum of effects(truth))
+
+The computation is causal: a log in one piece, in blocks, or sample by sample gives the same numbers to the last bit.
+The effects are subtracted in three steps:
+
+1. Effects that depend on time and temperature only are subtracted once.
+2. Sensors whose effects depend on the truth that they change are solved by fixed point
+   (``pipeline.physics.measurement``). Where a sample needs the sample before it, as for an angular acceleration, it takes
+   that sample's value of the same iteration.
+3. Effects that depend on the truth of the other sensor only are subtracted once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import numpy as np
+
+from pipeline.core.errors import InputError
+from pipeline.physics.calibration_file import read_calibration, sample_covariance, sensor_of
+from pipeline.physics.effects import load_python_effect, register
+from pipeline.physics.effects.base import OF_THE_ROOM
+from pipeline.physics.log_motion import FIELDS_OF_SIGNALS, ExponentialRegression, LogEnd, fields_used, log_motion
+from pipeline.physics.measurement import SensorEffects, sensor_effects, solve, without_effects
+from pipeline.core.records import SENSORS, FittedEffect, Motion, SensorCalibration, Values
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from pipeline.physics.measurement import Truths
+
+SMOOTHING_S = 3.0  # 30 samples of a thermometer at 10 Hz; a package warms up in minutes
+BLOCK = 8192  # samples that are computed at once: their arrays stay in the processor's cache
+OF_THE_PAST = {"specific_force_rate", "angular_acceleration", "direction"}
+
+
+class Compensated(NamedTuple):
+    """Specific force, g, and angular rate, deg/s, of the body; None for a sensor that was not given."""
+
+    accelerometer: Values | None
+    gyroscope: Values | None
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The effects of one sensor, divided by the signals that they depend on, for Python and for ``calibration.h``.
+
+    ``steady`` effects depend on time and temperature only, ``moving`` effects on the truth. ``fields``: effect to the
+    fields of ``Motion`` that it reads.
+    """
+
+    steady: list[FittedEffect]
+    moving: list[FittedEffect]
+    fields: dict[str, set[str]]
+
+    @classmethod
+    def of(cls, sensor: str, effects: Sequence[FittedEffect]) -> Self:
+        """Divide the given effects of a sensor."""
+        fields = {e.name: fields_used(sensor, [e]) for e in effects}
+        moving = [e for e in effects if fields[e.name] - OF_THE_ROOM]
+        return cls([e for e in effects if e not in moving], moving, fields)
+
+    @property
+    def used(self) -> set[str]:
+        """All fields that the effects read."""
+        return set().union(*self.fields.values())
+
+    def needs(self, effect: str) -> set[str]:
+        """Return the signals of a log that an effect needs."""
+        return set().union(*(FIELDS_OF_SIGNALS[field] for field in self.fields[effect]))
+
+
+def circular(steps: Mapping[str, Steps]) -> set[str]:
+    """Return the sensors whose effects depend on their own truth, directly or through the other sensor."""
+    moving = {s for s, step in steps.items() if step.moving}
+    looks_at = {s: set().union(*(steps[s].needs(e.name) for e in steps[s].moving)) & moving for s in moving}
+    return {s for s, seen in looks_at.items() if any(other == s or s in looks_at[other] for other in seen)}
+
+
+class CompensationStream:
+    """Compensation of one log, block by block, by the calibrations of the calibrated sensors.
+
+    ``smoothing``, s, is the memory of the temperature's smoothing (``pipeline.physics.log_motion``); 0: none.
+    """
+
+    def __init__(self, unit: str, calibrations: dict[str, SensorCalibration], smoothing: float) -> None:
+        self.unit, self.smoothing = unit, smoothing
+        self.steps = {s: Steps.of(s, sensor_effects(c)) for s, c in calibrations.items()}
+        self._steady = {s: SensorEffects.of(c, self.steps[s].steady) for s, c in calibrations.items()}
+        self._moving = {s: SensorEffects.of(c, self.steps[s].moving) for s, c in calibrations.items()}
+        self._linear = {s: SensorEffects.of(c, ()) for s, c in calibrations.items()}
+        self._line = ExponentialRegression(smoothing or 1.0)
+        self._ends = [LogEnd()]  # of the last block, one for each iteration
+
+    @property
+    def needs(self) -> set[str]:
+        """Signals that the effects need: ``accelerometer``, ``gyroscope``, ``temperature``, ``time``."""
+        return set().union(*(step.needs(effect) for step in self.steps.values() for effect in step.fields))
+
+    def apply(
+        self,
+        accelerometer: Any = None,  # noqa: ANN401
+        gyroscope: Any = None,  # noqa: ANN401
+        temperature: Any = None,  # noqa: ANN401
+        time: Any = None,  # noqa: ANN401
+    ) -> Compensated:
+        """Return the calibrated readings of the next sample or block; parameters as of ``Compensation.apply``."""
+        given = {"accelerometer": accelerometer, "gyroscope": gyroscope, "temperature": temperature, "time": time}
+        arrays, single = _checked(given)
+        for sensor in set(self.steps) & set(arrays):
+            for effect in self.steps[sensor].fields:
+                missing = sorted(self.steps[sensor].needs(effect) - set(arrays))
+                if missing:
+                    raise InputError(
+                        f"the {sensor} of unit {self.unit} was calibrated with the effect {effect}, "
+                        f"which needs {' and '.join(missing)}: give that too, or calibrate without the effect"
+                    )
+        sensors = [s for s in SENSORS if s in arrays]
+        n = len(arrays[sensors[0]])
+        found = {s: np.empty((n, 3)) if s in self.steps else arrays[s] for s in sensors}
+        for start in range(0, n, BLOCK):
+            block = slice(start, start + BLOCK)
+            # doubles, contiguous axis by axis, the order in which they are processed
+            cut = {name: np.asarray(a[block], np.float64, order="F") for name, a in arrays.items()}
+            for s, truth in self._block(cut).items():
+                if s in self.steps:
+                    found[s][block] = truth
+        shaped = {s: value[0] if single else value for s, value in found.items()}
+        return Compensated(shaped.get("accelerometer"), shaped.get("gyroscope"))
+
+    def _block(self, arrays: Mapping[str, Values]) -> Truths:
+        """Return the truth of each sensor in a block of samples."""
+        readings = {s: arrays[s] for s in SENSORS if s in arrays}
+        steps = {s: self.steps[s] for s in readings if s in self.steps}
+        used = set().union(*(step.used for step in steps.values()))
+        zeros = np.zeros_like(next(iter(readings.values()))) if used else np.zeros((0, 3))
+        clock, warm = arrays.get("time", zeros[:, 0]), arrays.get("temperature")
+        if warm is not None and "time" in arrays and "temperature" in used and self.smoothing > 0:
+            warm = self._line.apply(clock, warm)
+
+        def true_motion(truths: Truths, number: int) -> Motion:
+            force, rate = truths.get("accelerometer", zeros), truths.get("gyroscope", zeros)
+            end = self._ends[min(number, len(self._ends) - 1)]
+            return log_motion(clock, specific_force=force, angular_rate=rate, temperature=warm, used=used, end=end)
+
+        if any(step.steady for step in steps.values()):
+            room = log_motion(
+                clock, specific_force=zeros, angular_rate=zeros, temperature=warm, used=set(), end=LogEnd()
+            )
+            readings |= {s: self._steady[s].take_off(readings[s], room) for s in steps}
+        return self._solved(steps, readings, true_motion, used & OF_THE_PAST)
+
+    def _solved(
+        self, steps: dict[str, Steps], readings: Truths, true_motion: Callable[[Truths, int], Motion], past: set[str]
+    ) -> Truths:
+        """Subtract the effects that depend on the truth; store the end of the block for each iteration."""
+        turns = circular(steps)
+        once = {s: self._moving[s] for s, step in steps.items() if step.moving and s not in turns}
+        ends: list[LogEnd] = []
+
+        def motion_of(truths: Truths, number: int) -> Motion:
+            motion = true_motion(truths, number)
+            if past:
+                ends.append(self._ends[min(number, len(self._ends) - 1)].after(motion, past))
+            return motion
+
+        truths = solve({s: self._moving[s] if s in turns else self._linear[s] for s in steps}, readings, motion_of)
+        settled = len(ends)
+        for number in range(settled, max(settled + 1, len(self._ends)) if turns and past else settled):
+            motion_of(truths, number)
+        if once:
+            motion = true_motion(truths, len(self._ends)) if turns else motion_of(truths, 0)
+            truths |= without_effects(once, readings, motion)
+        self._ends = ends or self._ends
+        return truths
+
+
+def _checked(given: Mapping[str, ArrayLike | None]) -> tuple[dict[str, NDArray[Any]], bool]:
+    """Return the signals that are given as arrays of one length, and whether it was a single sample."""
+    if given["accelerometer"] is None and given["gyroscope"] is None:
+        raise InputError("give accelerometer, gyroscope or both: there is nothing to compensate")
+    arrays = {name: np.asarray(value) for name, value in given.items() if value is not None}
+    sensor = next(s for s in SENSORS if s in arrays)
+    single = arrays[sensor].ndim == 1
+    if single:
+        arrays = {s: a[None] if s in SENSORS else np.atleast_1d(a) for s, a in arrays.items()}
+    n = len(arrays[sensor])
+    for name, array in arrays.items():
+        expected = (n, 3) if name in SENSORS else (n,)
+        if array.shape != expected:
+            raise InputError(f"{name} has the shape {array.shape}; expected {expected}, as of the {sensor}")
+    return arrays, single
+
+
+@dataclass(frozen=True)
+class Compensation:
+    """The calibration of a unit, ready to be applied to arrays; readings of a sensor without one pass unchanged.
+
+    ``covariances``: sensor to the covariance of a calibrated sample, (3, 3) array in g^2 or (deg/s)^2, where known.
+    ``calibrated_range``: of that name in ``calibrations/<unit>.json``; empty where it is not known.
+    """
+
+    accelerometer: SensorCalibration | None
+    gyroscope: SensorCalibration | None
+    unit: str = ""
+    covariances: Mapping[str, Values] = field(default_factory=dict)
+    calibrated_range: Mapping[str, float | list[float]] = field(default_factory=dict)
+
+    def apply(
+        self,
+        accelerometer: Any = None,  # noqa: ANN401  (what numpy takes for an array)
+        gyroscope: Any = None,  # noqa: ANN401
+        temperature: Any = None,  # noqa: ANN401
+        time: Any = None,  # noqa: ANN401
+        *,
+        smoothing: float = SMOOTHING_S,
+    ) -> Compensated:
+        """Return the calibrated readings of a log, or of a single sample, in the shapes that were given.
+
+        Parameters
+        ----------
+        accelerometer : (n, 3) or (3,) array, g, optional
+        gyroscope : (n, 3) or (3,) array, deg/s, optional
+        temperature : (n,) array or float, degC, optional
+            Needed where a fitted effect depends on it.
+        time : (n,) array or float, s since power-on, optional
+            Likewise; also with it the temperature is smoothed, causally.
+        smoothing : float, s
+            Memory of the temperature's smoothing (``pipeline.physics.log_motion``); 0: none.
+
+        Raises
+        ------
+        InputError
+            If neither sensor is given, shapes do not match, or an effect needs a signal that is not given.
+        """
+        return self.stream(smoothing).apply(accelerometer, gyroscope, temperature, time)
+
+    def stream(self, smoothing: float = SMOOTHING_S) -> CompensationStream:
+        """Return an object whose ``apply`` takes a log block by block, with the same result as in one piece."""
+        known = {s: c for s in SENSORS if (c := self.calibration(s)) is not None}
+        return CompensationStream(self.unit, known, smoothing)
+
+    def calibration(self, sensor: str) -> SensorCalibration | None:
+        """Return the calibration of ``accelerometer`` or ``gyroscope``."""
+        return self.accelerometer if sensor == "accelerometer" else self.gyroscope
+
+
+def load(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compensation:
+    """Read ``calibrations/<unit>.json``; parameters and errors as of ``pipeline.load_calibration``."""
+    for python_file in python_effects:
+        register(load_python_effect(python_file))
+    file = Path(path)
+    return compensation_of(read_calibration(file), file)
+
+
+def compensation_of(document: dict[str, Any], file: Path | None = None) -> Compensation:
+    """Return the calibration of a document (``calibrations/<unit>.json``); ``file`` names it in errors."""
+    accelerometer, gyroscope = (sensor_of(document, sensor, file or Path()) for sensor in SENSORS)
+    covariances = {s: c for s in SENSORS if (c := sample_covariance(document, s)) is not None}
+    known = document.get("calibrated_range", {})
+    return Compensation(accelerometer, gyroscope, str(document.get("unit", "")), covariances, known)

@@ -1,0 +1,318 @@
+"""Effects that no formula describes: of the table, warm-up, errors of the time stamps, and a lag of the readings.
+
+With K the inverse of the calibration matrix, f the specific force, g, A the table angle, e_a the unit vector of axis a,
+and the parameters of ``configs/effect/`` (angles in deg):
+
+    table_tilt:            accelerometer: z = K R^T |f| (pi/180) (-d_y, d_x, 0), R the rotation from body to level
+
+    turns about axis a:
+    table_axis_nonorthogonality, d_a: lean of the axis along the other two body axes at angle 0; R_a: a turn
+                           accelerometer: z = K [theta x f - R_a(-A) (theta x f_0)] (pi/180),  theta = e_a x d_a
+                           gyroscope:     z = K (pi/180) d_a dA/dt
+    table_backlash, the angle lags by B_a in the direction s = +1 or -1 of the present or last turn
+                           accelerometer: z = K (e_a x f) (pi/180) B_a s
+    table_encoder_error, an eccentric encoder
+                           accelerometer: z = -K (e_a x f) (pi/180) (A_a cos A + B_a sin A)
+                           gyroscope:     z = K e_a dA/dt (pi/180) (B_a cos A - A_a sin A)
+    table_rate_ripple; the accelerometer shows the integral of the ripple, the log shows the commanded angle
+                           accelerometer: z = -K (e_a x f) [A_a sin A + B_a (1 - cos A)]
+                           gyroscope:     z = K e_a dA/dt (A_a cos A + B_a sin A)
+
+    warm_up:       z = A exp(-t / tau),  t the time since power-on, s; 0 at tau = 0
+    time_offset:   reading(t) = model(t + tau)
+    clock_rate:    reading(t) = model(t + 1e-6 e t)
+    low_pass_lag:  reading(t) = model(u'),  u'(t) = integral_0^inf exp(-s / tau) / tau u(t - s) ds
+
+In the last three z = K (u' - u), with u the truth, g or deg/s, and u' the truth at the changed time or behind the lag.
+tau is in s: an offset is negative where the reading is late, a time constant is 0 or more. e is in ppm. The lag of a
+turn's rate is exact; the lag of other signals is a Gauss-Laguerre sum, exact for polynomials of degree 7 in time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.physics.effects.base import Layout, every_axis, length, truth, truth_rate, turning_direction
+from pipeline.physics.effects.formula_effect import DeclaredEffect
+from pipeline.physics.formula import c_number
+from pipeline.physics.kinematics import ABOUT, NODES, UP_AT_ZERO, WEIGHTS, skew, turn_about_axis
+
+if TYPE_CHECKING:
+    from pipeline.core.records import Motion, Values
+
+
+VERTICAL_SINE = 0.5  # sine of the elevation of the turn axis, which is 0 (level axis) or 1 (vertical axis)
+SIGNS = np.array([[1.0], [-1.0]])  # of d_x and d_y in the equation above
+STARTS_S = (60.0, 180.0, 500.0, 1500.0)  # from a part of some grams to a box of some kilograms, in factors of three
+MIN_WARM_UP_S, MAX_WARM_UP_S = 1.0, 1e5  # a shorter warm-up is a step at the start, a longer one a drift
+START_LAG_S = 0.005  # not 0, where a lag and a time offset have the same column; below the lag of a 30 Hz filter
+PPM = 1e-6  # one part in a million
+DIFFERENCE_STEP_S = 1e-5  # of the central difference: its rounding is 1e-11 of u per second
+
+
+class TableTilt(DeclaredEffect):
+    """Tilt of the table: two coefficients."""
+
+    layout = Layout.SHARED
+    needs = ("level",)
+    unseen = MappingProxyType({"gyroscope": "the direction of gravity does not change a rate"})
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return K times level y and minus level x in the body frame, times gravity; zeros for the gyroscope."""
+        del values
+        assert motion.level is not None  # noqa: S101
+        if sensor == "gyroscope":
+            return np.zeros((len(motion.time), 3, 2))
+        gravity = np.linalg.norm(motion.specific_force, axis=1)[:, None, None]
+        across = (motion.level[:, [1, 0], :] * SIGNS).transpose(0, 2, 1)
+        return np.asarray(np.radians(1.0) * gravity * (K @ across))
+
+
+class _OfTurns(DeclaredEffect):
+    """An error in turns of the table, with the same number of parameters for each axis."""
+
+    layout = Layout.SHARED
+    needs: tuple[str, ...] = ("angle",)
+    each = 2
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return the columns of the turn axis, zeros for the others."""
+        del values
+        out = np.zeros((len(motion.time), 3, 3 * self.each))
+        if motion.axis is not None and motion.angle is not None and motion.rate is not None:
+            mine = out[:, :, self.each * motion.axis : self.each * (motion.axis + 1)]
+            mine[:] = np.stack(self.in_turn(sensor, motion, motion.axis, K), axis=2)
+        return out
+
+    def in_turn(self, sensor: str, motion: Motion, axis: int, K: Values) -> tuple[Values, ...]:
+        """Return the column of each parameter in a turn about an axis: (n, 3) arrays."""
+        raise NotImplementedError
+
+
+class TableAxisNonorthogonality(_OfTurns):
+    """Non-orthogonality of the table's axes: six coefficients."""
+
+    needs = ("level",)
+
+    def in_turn(self, sensor: str, motion: Motion, axis: int, K: Values) -> tuple[Values, ...]:
+        """Return the columns of the lean along the next axis and along the one after it."""
+        assert motion.level is not None  # noqa: S101
+        assert motion.rate is not None  # noqa: S101
+        assert motion.angle is not None  # noqa: S101
+        upright = abs(motion.level[0, 2, axis]) > VERTICAL_SINE
+        up = motion.level[0, 2] if upright else UP_AT_ZERO[axis]
+        f, columns = motion.specific_force, []
+        for step in (1, 2):
+            lean = np.zeros(3)
+            lean[(axis + step) % 3] = np.radians(1.0)
+            if sensor == "gyroscope":
+                columns.append(motion.rate[:, None] * (K @ lean))
+                continue
+            across = skew(ABOUT[axis] @ lean)  # across @ u = theta x u
+            home = turn_about_axis(across @ up, axis, -motion.angle)
+            columns.append((f @ across.T - length(f)[:, None] * home) @ K.T)
+        return tuple(columns)
+
+
+class TableBacklash(_OfTurns):
+    """Backlash of the table: one coefficient for each turn axis."""
+
+    each = 1
+    needs_both_directions = True
+    unseen = MappingProxyType({"gyroscope": "an angle that is behind by a constant does not change the rate"})
+
+    def in_turn(self, sensor: str, motion: Motion, axis: int, K: Values) -> tuple[Values, ...]:
+        """Return the derivative with respect to the angle times the direction; zeros for the gyroscope."""
+        if sensor == "gyroscope":
+            return (np.zeros((len(motion.time), 3)),)
+        slope = motion.specific_force @ (np.radians(1.0) * K @ ABOUT[axis]).T
+        return (slope * turning_direction(motion)[:, axis, None],)
+
+
+class TableEncoderError(_OfTurns):
+    """Angle error with a period of one turn: two coefficients for each turn axis."""
+
+    def in_turn(self, sensor: str, motion: Motion, axis: int, K: Values) -> tuple[Values, ...]:
+        """Return the columns of A and B."""
+        cosine, sine, rate = _cosine_sine_rate(motion)
+        if sensor == "gyroscope":
+            slope = np.radians(rate) * K[:, axis]
+            return -slope * sine, slope * cosine
+        slope = motion.specific_force @ (-np.radians(1.0) * K @ ABOUT[axis]).T
+        return slope * cosine, slope * sine
+
+
+class TableRateRipple(_OfTurns):
+    """Rate error with a period of one turn: two coefficients for each turn axis."""
+
+    needs_motion = True
+
+    def in_turn(self, sensor: str, motion: Motion, axis: int, K: Values) -> tuple[Values, ...]:
+        """Return the columns of A and B."""
+        cosine, sine, rate = _cosine_sine_rate(motion)
+        if sensor == "gyroscope":
+            slope = rate * K[:, axis]
+            return slope * cosine, slope * sine
+        slope = motion.specific_force @ (-K @ ABOUT[axis]).T
+        return slope * sine, slope * (1.0 - cosine)
+
+
+def _cosine_sine_rate(motion: Motion) -> tuple[Values, Values, Values]:
+    """Return cosine and sine of the table angle, and its rate, deg/s: (n, 1) arrays."""
+    assert motion.angle is not None  # noqa: S101
+    assert motion.rate is not None  # noqa: S101
+    angle = np.radians(motion.angle)[:, None]
+    return np.cos(angle), np.sin(angle), motion.rate[:, None]
+
+
+class WarmUp(DeclaredEffect):
+    """Exponential settling of the bias: one amplitude an axis and one time constant."""
+
+    layout = Layout.EVERY_AXIS
+    needs_clock = True
+    nonlinear = ("time_constant",)
+
+    def starts(self, sensor: str) -> list[Values]:
+        """Return a small grid of time constants."""
+        del sensor
+        return [np.array([0.0, 0.0, 0.0, tau]) for tau in STARTS_S]
+
+    def stepped(self, values: Values, step: Values) -> Values:
+        """Return ``values + step`` with the time constant at most halved or doubled."""
+        new = values + step
+        new[3] = np.clip(new[3], max(values[3] / 2.0, MIN_WARM_UP_S), min(values[3] * 2.0, MAX_WARM_UP_S))
+        return new
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return ``exp(-t / tau)``."""
+        del sensor, K
+        tau = values[3]
+        decay = np.exp(-motion.time / tau) if tau > 0 else np.zeros_like(motion.time)
+        return np.asarray(decay[:, None])
+
+    def columns(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return the columns of A, and the column of tau, ``A t / tau^2 exp(-t / tau)``."""
+        decay = self.regressors(sensor, motion, K, values)
+        tau = values[3]
+        slope = decay[:, 0] * motion.time / tau**2 if tau > 0 else np.zeros_like(motion.time)
+        return np.concatenate([every_axis(decay), (slope[:, None] * values[:3])[:, :, None]], axis=2)
+
+    def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return ``A exp(-t / tau)``."""
+        return self.regressors(sensor, motion, K, values) * values[:3]
+
+    def in_c(self, values: Values) -> list[str]:
+        """Return ``A exp(-t / tau)`` of each axis as C expressions."""
+        decay = f"(imu_real)exp(-m->time / {c_number(values[3])})" if values[3] > 0 else "0"
+        return [f"{c_number(a)} * {decay}" for a in values[:3]]
+
+
+def shifted(motion: Motion, offset: float | Values) -> Motion:
+    """Return the motion at ``time + offset``, s: a float or (n,) array.
+
+    Without a trajectory between the samples the truth is extrapolated linearly.
+    """
+    if not np.any(offset):
+        return motion
+    if motion.at_offset is not None:
+        return _seen_from(motion, motion.at_offset(offset=offset))
+    by = np.broadcast_to(offset, motion.time.shape)[:, None]
+    return replace(
+        motion,
+        specific_force=motion.specific_force + motion.specific_force_rate * by,
+        angular_rate=motion.angular_rate + motion.angular_acceleration * by,
+    )
+
+
+def _seen_from(motion: Motion, moved: Motion | None) -> Motion:
+    """Return a moved motion with the rests and directions of the logged motion."""
+    assert moved is not None  # noqa: S101
+    return replace(moved, still=motion.still, direction=motion.direction)
+
+
+class _Timing(DeclaredEffect):
+    """An effect that moves the motion in time: it adds K times the change of the truth."""
+
+    layout = Layout.SHARED
+    needs_motion = True
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return K times the derivative of the truth with respect to the only parameter."""
+        slope = self.slope(sensor, self.moved(motion, values))
+        assert slope is not None  # noqa: S101
+        return np.asarray(slope @ K.T)[:, :, None]
+
+    def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return ``K (u' - u)``."""
+        change = truth(sensor, self.moved(motion, values)) - truth(sensor, motion)
+        return np.asarray(change @ K.T)
+
+
+class TimeOffset(_Timing):
+    """A constant time offset: one coefficient."""
+
+    nonlinear = ("tau",)
+
+    def slope(self, sensor: str, moved: Motion) -> Values:
+        """Return ``du/dt``."""
+        return truth_rate(sensor, moved)
+
+    def moved(self, motion: Motion, values: Values) -> Motion:
+        """Return the motion at ``t + tau``."""
+        return shifted(motion, values[0])
+
+
+class ClockRate(_Timing):
+    """A rate error of the clock: one coefficient."""
+
+    needs_clock = True
+    nonlinear = ("e",)
+
+    def slope(self, sensor: str, moved: Motion) -> Values:
+        """Return ``1e-6 t du/dt``."""
+        return PPM * moved.time[:, None] * truth_rate(sensor, moved)
+
+    def moved(self, motion: Motion, values: Values) -> Motion:
+        """Return the motion at ``t + 1e-6 e t``."""
+        return shifted(motion, PPM * values[0] * motion.time)
+
+
+class LowPassLag(_Timing):
+    """A first-order lag: one coefficient."""
+
+    nonlinear = ("tau",)
+
+    def starts(self, sensor: str) -> list[Values]:
+        """Return a short lag: at 0 its column equals that of a time offset."""
+        del sensor
+        return [np.array([START_LAG_S])]
+
+    def stepped(self, values: Values, step: Values) -> Values:
+        """Return ``values + step``, not below zero."""
+        return np.maximum(values + step, 0.0)
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return ``K du'/dtau``: ``-K du/dt`` at a lag of 0, else a central difference."""
+        if values[0] <= DIFFERENCE_STEP_S:
+            slope = -truth_rate(sensor, motion)
+        else:
+            later, sooner = (
+                truth(sensor, self.moved(motion, values + d)) for d in (DIFFERENCE_STEP_S, -DIFFERENCE_STEP_S)
+            )
+            slope = (later - sooner) / (2.0 * DIFFERENCE_STEP_S)
+        return np.asarray(slope @ K.T)[:, :, None]
+
+    def moved(self, motion: Motion, values: Values) -> Motion:
+        """Return the motion behind a first-order lag."""
+        if values[0] <= 0.0:
+            return motion
+        if motion.at_lag is not None:
+            return _seen_from(motion, motion.at_lag(lag=float(values[0])))
+        nodes = [shifted(motion, -values[0] * node) for node in NODES]
+        names = ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate")
+        means = {name: sum(w * getattr(n, name) for w, n in zip(WEIGHTS, nodes, strict=True)) for name in names}
+        return replace(motion, **means, at_offset=lambda offset=0.0: self.moved(shifted(motion, offset), values))

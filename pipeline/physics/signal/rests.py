@@ -1,0 +1,319 @@
+"""Find the rests in a recording: from the log of a table, or from the readings of the sensor.
+
+From the readings (after Tedaldi, Pretto & Menegatti, ICRA 2014, section IV), a sample is at rest where the variance of
+the specific force in a short window, summed over the axes, is below a multiple of the sensor's noise,
+
+    v[n] = sum_axes var(f[n .. n+W-1]) < m v_0
+
+where
+
+    W   : window, 0.5 s and at least 5 samples
+    v_0 : the noise: the 5th percentile of v, so that no part of the recording must be known to be a rest; at least the
+          variance of rounding, by the smallest step between successive readings
+    m   : the multiple, from the widest range over which the number of rests stays the same
+
+A rest is trimmed by W at its start. A gyroscope must be quiet, too (``pipeline.physics.signal.quiet_motion``), as a turn about
+the vertical does not change the specific force. A rest is refused if its angular rate differs from that of the
+neighbouring rests, the direction of the specific force moves, or the readings scatter more than noise. A turn by theta
+shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core.records import BETWEEN_ATTITUDES_S, Integers, Mask, Recording, Values, median, noise_of_steps, once
+from pipeline.physics.signal.filters import filter_autocovariance, stretch_starts
+from pipeline.physics.signal.quiet_motion import RATE_LIMIT_DPS, counts_of, creep_of_rest, quiet_pieces, windows
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    Spans = list[tuple[int, int]]
+
+RATE_AT_REST_DPS = 0.02  # above the rate noise of a resting table
+SETTLING_S = 0.3  # fifteen time constants of the slowest filter of 20 ms, as in ``pipeline.physics.encoder_trajectory``
+
+WINDOW_S = 0.5  # shorter than a rest, longer than a tremor's period (8 to 12 Hz)
+GAP_S = 1.0  # longer than any regular interval of a log
+SHORTEST_REST_S = 1.0  # two windows
+VARIANCE_MULTIPLES = np.geomspace(4.0, 1000.0, 25)  # of a variance: 2 to 30 times the noise, in steps of an eighth
+MIN_NOISE_VARIANCE_G2 = 1e-12  # g^2, keeps the multiple of a noise-free recording above rounding
+NEIGHBOUR_RESTS = 5  # rests: their median is robust against two that turned
+TURN_LIMIT_DEG = 2.0  # 0.05 mg, see above
+# A steady tilt is modelled up to this rate (``pipeline.physics.signal.quiet_motion``); units in a hand or on a soft support
+# creep by up to 0.3 deg/s.
+CREEP_LIMIT_DPS, STEADY_LIMIT_DEG = 0.5, 10.0
+SCATTER_LIMIT = 3.0  # times the noise; noise alone stays below 1.3 in the 100 samples of a rest at 100 Hz
+SMALLEST_SCATTER_G2 = 3e-6  # 1 mg on each axis, so that a quiet sensor may settle by 0.1 deg
+SIGNIFICANT_REST_DEVIATIONS = 6.0  # standard deviations
+REST_EDGE_S, FEWEST_TO_SETTLE = 0.5, 6  # edge of a rest that may move, at most a third of it; samples that this needs
+SETTLED_DIFFERENCE_DEVIATIONS = 8.0  # of the noise between successive samples: white noise passes in 1e-14
+
+RATE_AT_REST = "rate_at_rest_dps"  # in the source of a turn: what the gyroscope reads in the recordings at rest
+SLOW_PARTS, SLOW_PART_S = 120, 0.2  # parts of slow movement: a turn at 30 deg/s shortens their mean by 0.5 mg
+SOAK_PARTS = 40  # of a soak: over a span of 80 degC, 2 degC each
+
+
+@dataclass(frozen=True)
+class Rest:
+    """One rest of a recording: samples ``start <= n < stop``, and the reason where its mean may not be used."""
+
+    start: int
+    stop: int
+    accepted: bool = True
+    reason: str = ""
+
+
+def runs(mask: Mask) -> Spans:
+    """Return the (start, stop) index pairs of the runs of True in a mask."""
+    starts, stops = _edges(mask)
+    return list(zip(starts.tolist(), stops.tolist(), strict=True))
+
+
+def _edges(mask: Mask) -> tuple[Integers, Integers]:
+    """Return where the runs of True in a mask start and stop."""
+    padded = np.zeros(len(mask) + 2, bool)
+    padded[1:-1] = mask
+    edges = np.flatnonzero(padded[1:] != padded[:-1])
+    return edges[::2], edges[1::2]
+
+
+def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> Mask:
+    """Return which samples are at rest and settled, by a table's rate in deg/s: (n,) array of bool.
+
+    A rest begins where |rate| falls below 0.02 deg/s. Its first ``settling`` seconds are not included, unless the
+    recording begins with the rest.
+    """
+    still = np.abs(rate) < RATE_AT_REST_DPS
+    starts, stops = _edges(still)
+    settled = np.repeat(time[starts] + settling, stops - starts)
+    if still[:1].any():
+        settled[: stops[0]] = -np.inf
+    still[still] = time[still] >= settled
+    return still
+
+
+@once
+def rests_from_table(recording: Recording) -> list[Rest]:
+    """Return the rests by the rate of the table, or by the derivative of its angle; none without such a log.
+
+    Their first 0.3 s, and the delay of the recording's filter, are not included.
+    """
+    rate = recording.logged_rate
+    if rate is None:
+        return []
+    still = still_samples(recording.time, rate, SETTLING_S + float(recording.filter.get("delay_s", 0.0)))
+    return [Rest(start, stop) for start, stop in runs(still)]
+
+
+@once
+def find_rests(recording: Recording) -> list[Rest]:
+    """Find the rests of a hand-held recording from its readings, in order of time, each at least 1 s long.
+
+    A rest in which the sensor moved is marked as refused, with the reason. If a sheet states the kind of the recording,
+    ``rest`` is one rest, the longest or, if none is found, the whole; ``soak`` parts of equal length, in which the
+    temperature hardly changes; ``slow`` short parts, for the length of gravity alone; ``attitudes`` the blocks of rows.
+    """
+    if recording.kind == "soak":
+        edges = np.linspace(0, recording.samples, min(SOAK_PARTS, recording.samples) + 1).astype(int)
+        return [Rest(a, b) for a, b in pairwise(edges.tolist())]
+    if recording.kind == "slow":
+        size = max(5, round(SLOW_PART_S / _interval(recording))) if recording.samples > 1 else 1
+        starts = np.unique(np.linspace(0, max(recording.samples - size, 0), SLOW_PARTS).astype(int))
+        apart = starts[np.concatenate([[True], np.diff(starts) >= size])]
+        return [Rest(a, min(a + size, recording.samples)) for a in apart.tolist()]
+    if recording.kind == "attitudes":
+        starts = np.flatnonzero(np.diff(recording.time_ns) > 0.5 * BETWEEN_ATTITUDES_S * 1e9) + 1
+        return [Rest(a, b) for a, b in pairwise([0, *starts.tolist(), recording.samples])]
+    found = _rests_by_readings(recording)
+    if recording.kind != "rest":
+        return found
+    longest = max((r for r in found if r.accepted), key=lambda r: r.stop - r.start, default=None)
+    return [longest or Rest(0, recording.samples)]
+
+
+def _rests_by_readings(recording: Recording) -> list[Rest]:
+    force = recording.accelerometer
+    size = max(5, round(WINDOW_S / _interval(recording))) if recording.samples > 1 else 5
+    if force is None or recording.samples < 2 * size:
+        return []
+    variance = windows(force, size)[1]
+    rounding = float(np.sum(counts_of(np.abs(np.diff(force[np.isfinite(force).all(axis=1)], axis=0))) ** 2)) / 12.0
+    noise = max(float(np.percentile(variance, 5.0)), rounding, MIN_NOISE_VARIANCE_G2)
+    variance[_spoilt(recording, size)] = np.inf
+    found = [_below(variance, multiple * noise, recording, size) for multiple in VARIANCE_MULTIPLES]
+    quiet = found[_plateau([len(rests) for rests in found])]
+    rate = recording.gyroscope
+    if rate is not None and quiet:
+        interval = _interval(recording)
+        quiet = quiet_pieces(rate, quiet, interval, max(size, round(SHORTEST_REST_S / interval)))
+    return assess_rests(recording, quiet, noise)
+
+
+def _interval(recording: Recording) -> float:
+    """Return the mean time between samples, s, without gaps; the median would be wrong for stamps in bursts."""
+    steps = np.diff(recording.time_ns)
+    short = steps[steps < GAP_S * 1e9]
+    return float(short.mean()) / 1e9 if short.size else recording.interval
+
+
+def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noise_variance: float) -> list[Rest]:
+    """Return rests of given start and stop; a rest in which the sensor moved is marked as refused.
+
+    ``noise_variance``: of the specific force at rest, g^2, summed over the axes.
+    """
+    rests = [Rest(start, stop) for start, stop in intervals]
+    reasons = [_turn(recording, r) or _scatter(recording, r, noise_variance) for r in rests]
+    rates = _rate_reasons(recording, rests)
+    return [
+        replace(rest, accepted=not reason, reason=reason)
+        for rest, reason in zip(rests, (a or b for a, b in zip(reasons, rates, strict=True)), strict=True)
+    ]
+
+
+def _spoilt(recording: Recording, size: int) -> Mask:
+    """Return the windows with a clipped, stuck or missing reading, or over a gap as long as a window."""
+    assert recording.accelerometer is not None  # noqa: S101
+    bad = np.logical_not(np.all(np.isfinite(recording.accelerometer), axis=1))
+    bad |= ~recording.valid
+    if recording.gyroscope is not None:
+        bad |= np.logical_not(np.all(np.isfinite(recording.gyroscope), axis=1))
+    bad[1:] |= np.diff(recording.time_ns) > size * _interval(recording) * 1e9
+    total = np.concatenate([[0], np.cumsum(bad)])
+    return total[size:] > total[:-size]
+
+
+def _below(variance: Values, threshold: float, recording: Recording, size: int) -> Spans:
+    """Return the trimmed stretches whose windows are below a threshold, if they are long enough."""
+    interval = _interval(recording)
+    lag = int(np.ceil(5.0 * float(recording.filter.get("delay_s", 0.0)) / interval))
+    shortest = max(size, round(SHORTEST_REST_S / interval))
+    trimmed = ((start + size + lag, stop - 1) for start, stop in runs(variance < threshold))
+    return [(start, stop) for start, stop in trimmed if stop - start >= shortest]
+
+
+def _plateau(counts: Sequence[int]) -> int:
+    """Return an index in the lower third of the longest run of equal counts above zero."""
+    steps = np.flatnonzero(np.diff(counts)) + 1
+    edges = [0, *steps.tolist(), len(counts)]
+    best = max(range(len(edges) - 1), key=lambda i: (counts[edges[i]] > 0, edges[i + 1] - edges[i]))
+    return int(edges[best] + (edges[best + 1] - edges[best]) // 3)
+
+
+def _scatter(recording: Recording, rest: Rest, noise_variance: float) -> str:
+    assert recording.accelerometer is not None  # noqa: S101
+    creep = creep_of_rest(recording, rest.start, rest.stop)
+    variance = float(creep.squares.sum()) / max(creep.freedom, 1)
+    ratio = np.sqrt(variance / max(noise_variance, SMALLEST_SCATTER_G2))
+    if ratio <= SCATTER_LIMIT:
+        return ""
+    return f"specific force scatters {ratio:.1f} times the noise (limit {SCATTER_LIMIT:g})"
+
+
+def _turn(recording: Recording, rest: Rest) -> str:
+    """Compare the directions of the four quarters of a rest, after subtraction of a steady creep."""
+    assert recording.accelerometer is not None  # noqa: S101
+    force = recording.accelerometer[rest.start : rest.stop]
+    creep = creep_of_rest(recording, rest.start, rest.stop)
+    rate, span = float(np.linalg.norm(creep.rate)), float(recording.time[rest.stop - 1] - recording.time[rest.start])
+    if 0.0 < rate <= CREEP_LIMIT_DPS and rate * span <= STEADY_LIMIT_DEG:
+        steady = np.cross(force.mean(axis=0), np.radians(creep.rate))  # du/dt = -omega x u
+        force = force - np.outer(recording.time[rest.start : rest.stop] - recording.time[rest.start], steady)
+    quarter = len(force) // 4
+    if quarter == 0:
+        return ""
+    blocks = force[: 4 * quarter].reshape(4, quarter, 3)
+    means, length = blocks.mean(axis=1), float(np.linalg.norm(force.mean(axis=0)))
+    moved = float(np.max(np.linalg.norm(means[:, None] - means[None], axis=2)))
+    noise = float(np.sqrt(blocks.var(axis=1).sum(axis=1).mean() / quarter))
+    angle = np.degrees(moved / length) if length > 0 else 0.0
+    if angle <= TURN_LIMIT_DEG or moved <= SIGNIFICANT_REST_DEVIATIONS * noise:
+        return ""
+    return f"direction of the specific force moves by {angle:.1f} deg (limit {TURN_LIMIT_DEG:g} deg)"
+
+
+def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
+    """Compare the mean angular rate of each rest with the median of its neighbours in time, or with other recordings.
+
+    Not of all rests of a recording, because the bias changes with the temperature.
+    """
+    rate = recording.gyroscope
+    if rate is None or (len(rests) < 3 and RATE_AT_REST not in recording.source):
+        return [""] * len(rests)
+    parts = [rate[r.start : r.stop] for r in rests]
+    means = np.array([part.mean(axis=0) for part in parts])
+    reasons = []
+    for i, part in enumerate(parts):
+        first = int(np.clip(i - NEIGHBOUR_RESTS // 2, 0, max(len(rests) - NEIGHBOUR_RESTS, 0)))
+        usual = recording.source.get(RATE_AT_REST) or median(means[first : first + NEIGHBOUR_RESTS])
+        off = float(np.max(np.abs(means[i] - usual)))
+        noise = float(np.max(part.std(axis=0))) / np.sqrt(len(part))
+        reasons.append(
+            f"angular rate is {off:.2f} deg/s off that of other rests (limit {RATE_LIMIT_DPS:g} deg/s)"
+            if off > max(RATE_LIMIT_DPS, SIGNIFICANT_REST_DEVIATIONS * noise)
+            else ""
+        )
+    return reasons
+
+
+def stretches_of(recording: Recording, mask: Mask) -> Spans:
+    """Return the runs of True in a mask, cut at gaps in time."""
+    cuts = np.array(stretch_starts(recording)[1:-1], int)
+    pieces: Spans = []
+    for start, stop in runs(mask):
+        pieces += pairwise([start, *cuts[(cuts > start) & (cuts < stop)].tolist(), stop])
+    return pieces
+
+
+def usable(recording: Recording, values: Values) -> Mask:
+    """Return which samples are neither missing nor flagged by ingest: (n,) array."""
+    with np.errstate(invalid="ignore"):
+        finite = np.isfinite(values @ np.ones(values.shape[1]))  # a tenth of the time of ``all`` over three columns
+    return np.asarray(finite & recording.valid)
+
+
+def rest_readings(recording: Recording, sensor: str, *, whole_recording: bool) -> list[tuple[Values, Values]]:
+    """Return the times and readings of each rest of a recording."""
+    values = recording.reading(sensor)
+    assert values is not None  # noqa: S101
+    still = usable(recording, values)
+    if not whole_recording:
+        found = rests_from_table(recording)
+        if not found and recording.role == "rests":
+            found = find_rests(recording)
+        resting = np.zeros(recording.samples, bool)
+        memory = len(filter_autocovariance(recording)) - 1  # samples for which the output depends on earlier readings
+        ahead = memory if recording.filter.get("zero_phase") else 0
+        for rest in found:
+            first = rest.start + memory * (rest.start > 0)
+            resting[first : rest.stop - ahead * (rest.stop < recording.samples)] = rest.accepted
+        still &= resting
+    if whole_recording:  # a gap does not end a static rest: the likelihood uses the times
+        return [(recording.time[still], values[still])] if still.any() else []
+    settled = _settled(recording, values, stretches_of(recording, still))
+    return [(recording.time[a:b], values[a:b]) for a, b in settled if b - a > 2]
+
+
+def _settled(recording: Recording, values: Values, stretches: Spans) -> Spans:
+    """Remove samples that still move at the edges of rests: the clocks of sensor and table may differ."""
+    ends = np.array(stretches, int).reshape(-1, 2)
+    lengths = ends[:, 1] - ends[:, 0]
+    edges = np.minimum(int(REST_EDGE_S / recording.interval) + 1, lengths // 3)
+    for edge in np.unique(edges[lengths >= FEWEST_TO_SETTLE]).tolist():
+        alike = np.flatnonzero((edges == edge) & (lengths >= FEWEST_TO_SETTLE))
+        length = int(lengths[alike].min())
+        inside = values[ends[alike, :1] + np.arange(length)]
+        spread = noise_of_steps(np.abs(np.diff(inside, axis=1)), axis=1, keepdims=True)
+        for side in (1, -1):
+            ordered = inside if side == 1 else values[ends[alike, 1:] - 1 - np.arange(3 * edge)]
+            middle = median(ordered[:, edge : 3 * edge], axis=1, keepdims=True)
+            off = np.abs(ordered[:, :edge] - middle) > SETTLED_DIFFERENCE_DEVIATIONS * spread
+            moving = np.any(off & (spread > 0), axis=2)
+            cut = np.where(moving, np.arange(1, edge + 1), 0).max(axis=1)
+            ends[alike, 0 if side == 1 else 1] += side * cut
+    return [(a, b) for a, b in ends.tolist()]
