@@ -184,7 +184,13 @@ WAYS: dict[str, Callable[[Path, Path, Path], int]] = {
 }
 MODULES = {
     "csv": ["pyarrow.csv", "pyarrow.compute", "pipeline.app.field_logs.text_output", "pipeline.physics.compensation"],
-    "mcap": ["zstandard", "mcap.writer", "mcap.reader", "pipeline.app.field_logs.mcap_log", "pipeline.physics.compensation"],
+    "mcap": [
+        "zstandard",
+        "mcap.writer",
+        "mcap.reader",
+        "pipeline.app.field_logs.mcap_log",
+        "pipeline.physics.compensation",
+    ],
 }
 
 

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from pipeline.ingest.read import read_recordings
 from pipeline.app.one_unit import unit_row
+from pipeline.ingest.read import read_recordings
 from pipeline.unit import Task, UnitState, run_checked, run_steps
 
 if TYPE_CHECKING:

@@ -26,9 +26,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from pipeline.core.records import SENSORS, NotCalibrated
 from pipeline.physics.effects.base import truth
 from pipeline.physics.kinematics import reference_motion
-from pipeline.core.records import SENSORS, NotCalibrated
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
 from pipeline.unit import run_checked

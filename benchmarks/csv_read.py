@@ -59,8 +59,8 @@ def read_ours(path: Path) -> tuple[int, list[float]]:
 
 def read_marked(path: Path) -> tuple[int, list[float]]:
     from imu_logs.profile import Checks, load_profile  # noqa: PLC0415
-    from pipeline.ingest.read import read_table, to_recording  # noqa: PLC0415
     from pipeline.core.settings import Ingest, RecordingFile  # noqa: PLC0415
+    from pipeline.ingest.read import read_table, to_recording  # noqa: PLC0415
     from pipeline.simulation.description import shipped_settings  # noqa: PLC0415
 
     generic = shipped_settings(sensor="generic").sensor

@@ -38,21 +38,21 @@ from typing import Any
 
 import numpy as np
 
+from imu_research.study.bench import recordings_of
+from imu_research.study.cases import CYCLE_DEGC, NOISES, StudyCase, draw
+from imu_research.study.run import held_out_errors
+from imu_research.study.scores import wilson
+from pipeline.app.one_unit import ConfiguredUnit, unit_of_recordings
 from pipeline.core.errors import PipelineError
+from pipeline.core.records import SENSORS, Recording
 from pipeline.estimation.candidates import candidates_for
 from pipeline.estimation.observations import observe
 from pipeline.physics.effects import effect_from, forget, register
 from pipeline.physics.effects.base import Layout, per_axis, truth
 from pipeline.physics.formula import parse
 from pipeline.physics.kinematics import reference_motion
-from pipeline.app.one_unit import ConfiguredUnit, unit_of_recordings
-from pipeline.core.records import SENSORS, Recording
 from pipeline.simulation.description import shipped_settings
 from pipeline.simulation.session import Streams, random_environment
-from imu_research.study.bench import recordings_of
-from imu_research.study.cases import CYCLE_DEGC, NOISES, StudyCase, draw
-from imu_research.study.run import held_out_errors
-from imu_research.study.scores import wilson
 
 JSON = dict[str, Any]
 MODEL = "mpu6050"

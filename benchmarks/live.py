@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from apply import EFFECTS, in_c, write_calibration
 
-from pipeline.output.exports import ExportedUnit, export
 from pipeline.app.field_logs.ros2_node import MessageCalibrator
+from pipeline.output.exports import ExportedUnit, export
 from pipeline.physics.compensation import load
 
 if TYPE_CHECKING:

@@ -24,10 +24,10 @@ import numpy as np
 from scipy.signal import fftconvolve, lfilter
 from scipy.stats import beta
 
+from pipeline.core.records import Recording
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_search import CompositionSearch, best_of, count_of
 from pipeline.estimation.noise_terms import STOCHASTIC, solved, spectrum_of
-from pipeline.core.records import Recording
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -20,9 +20,9 @@ import numpy as np
 from pipeline.app.config import load_campaign
 from pipeline.app.one_unit import unit_of_campaign
 from pipeline.core.records import SENSORS, calibrated
+from pipeline.evaluation.held_out.attitude import attitude
 from pipeline.output.pages import campaign_page
 from pipeline.unit import Task, run_step
-from pipeline.evaluation.held_out.attitude import attitude
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -38,9 +38,9 @@ from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from pipeline.app.config import load_campaign
-from pipeline.ingest.read import read_recordings
 from pipeline.app.one_unit import unit_of_campaign, unit_row
 from pipeline.core.records import SENSORS
+from pipeline.ingest.read import read_recordings
 from pipeline.physics.signal.rests import find_rests
 from pipeline.physics.signal.segments import cut
 from pipeline.simulation.campaign import simulate_unit

@@ -19,9 +19,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import scipy.special  # noqa: F401  (imported when it is first needed)
 
 from pipeline.app.config import load_campaign
-from pipeline.evaluation.diagnosis import multi_position, turntable
-from pipeline.estimation.posterior import Answers
 from pipeline.app.one_unit import unit_of_campaign
+from pipeline.estimation.posterior import Answers
+from pipeline.evaluation.diagnosis import multi_position, turntable
 
 if TYPE_CHECKING:
     from pipeline.app.one_unit import ConfiguredUnit

@@ -29,12 +29,12 @@ seeds   simulates the campaign's recordings with every seed and writes FILE (dat
 
 def study(argv: Sequence[str]) -> int:
     """Run the blind study of the diagnosis: hide random effects, diagnose the units, and count correct answers."""
-    from pipeline.app.run_progress import Countdown  # noqa: PLC0415
     from imu_research.study.cases import FAMILIES  # noqa: PLC0415  (not needed for a comparison with the thesis)
     from imu_research.study.page import DIAGRAM, page  # noqa: PLC0415
     from imu_research.study.result import cases_of  # noqa: PLC0415
     from imu_research.study.run import RESULTS_FILE, TRUTH_FILE, read_lines, run_study  # noqa: PLC0415
     from imu_research.study.scores import accepted, answer_scores, family_scores, reliability_diagram  # noqa: PLC0415
+    from pipeline.app.run_progress import Countdown  # noqa: PLC0415
 
     parser = parser_of("study", study.__doc__, STUDY.format(", ".join(FAMILIES)))
     parser.add_argument("directory", type=Path, metavar="DIR", help="folder for the truth and the results")

@@ -33,6 +33,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.core.errors import PipelineError
+from pipeline.core.other_names import know_former_names
 from pipeline.core.version import VERSION
 
 if TYPE_CHECKING:
@@ -42,12 +43,24 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+    from pipeline.app.result import UnitResult
     from pipeline.output.campaign_results import CampaignResults
     from pipeline.physics.compensation import Compensation
-    from pipeline.app.result import UnitResult
+
+know_former_names()
 
 __version__ = VERSION
+EFFECT_NAMES = ("Effect", "Layout", "Owner", "axis_parameters")  # of an effect in Python; they import numpy
 __all__ = ["PipelineError", "__version__", "calibrate", "calibrate_unit", "load_calibration", "load_campaign"]
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401  (of the protocol)
+    """Return a name that an effect in Python needs (``docs/effects_of_your_own.md``)."""
+    if name not in EFFECT_NAMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from pipeline.physics.effects import base  # noqa: PLC0415  (numpy is imported only where it is needed)
+
+    return getattr(base, name)
 
 
 def calibrate(
@@ -127,8 +140,8 @@ def calibrate_unit(
         require_simulated,
         unit_of_campaign,
     )
-    from pipeline.output.outcome import DEFAULT_RESULTS  # noqa: PLC0415
     from pipeline.app.result import UnitResult  # noqa: PLC0415
+    from pipeline.output.outcome import DEFAULT_RESULTS  # noqa: PLC0415
 
     settings: Mapping[str, Any] = {
         "campaign": str(campaign),

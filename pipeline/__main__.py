@@ -12,20 +12,21 @@ from pipeline.app.steps import MODULES as STAGES
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # a job is one core; set before numpy is imported
 
-COMMANDS = {  # name: module and function in pipeline/app/commands
-    **{name: (name, "main") for name in ("run", "new", "check", "plan", "guide", "explain", "add")},
-    "remove": ("add", "remove"),
-    **{name: (name, "main") for name in ("convert", "apply", "noise", "simulate", "unpack", "config")},
-    "study": ("research", "study"),
-    "thesis": ("research", "thesis"),
+APP = "pipeline.app.commands"
+COMMANDS = {  # name: module and function
+    **{name: (f"{APP}.{name}", "main") for name in ("run", "new", "check", "plan", "guide", "explain", "add")},
+    "remove": (f"{APP}.add", "remove"),
+    **{name: (f"{APP}.{name}", "main") for name in ("convert", "apply", "noise", "simulate", "unpack", "config")},
+    "study": ("imu_research.commands", "study"),
+    "thesis": ("imu_research.commands", "thesis"),
 }
-HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
 PROGRAM = "imu-calibration" if Path(sys.argv[0]).name == "imu-calibration" else "python -m pipeline"
 
 
 def _summary(module: str, function: str) -> str:
     """Read the summary line of a command from its source: of the module for ``main``, else of the function."""
-    text = HERE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
+    text = ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
     start = 0 if function == "main" else text.index(f"\ndef {function}")
     return text[start:].split('"""', 2)[1].splitlines()[0]
 
@@ -33,15 +34,13 @@ def _summary(module: str, function: str) -> str:
 def _stage_summary(stage: str, module: str) -> str:
     """Read the summary line of a stage: of its module, or of its function in a module of several stages."""
     alone = [*STAGES.values()].count(module) == 1
-    return _summary(f"stages.{module}", "main" if alone and stage != "verdict" else stage)
+    return _summary(f"pipeline.app.steps.{module}", "main" if alone and stage != "verdict" else stage)
 
 
 def _help(*, stages: bool) -> str:
     hint = "COMMAND --help says more; --help --all names the stages of a run; --version"
     lines = [f"usage: {PROGRAM} COMMAND ... ({hint})", "", "commands:"]
-    lines += [
-        f"  {name:<12} {_summary(f'commands.{module}', function)}" for name, (module, function) in COMMANDS.items()
-    ]
+    lines += [f"  {name:<12} {_summary(module, function)}" for name, (module, function) in COMMANDS.items()]
     if stages:
         lines += ["", "stages, which the rules of the workflow call:"]
         lines += [f"  {name:<12} {_stage_summary(name, module)}" for name, module in STAGES.items()]
@@ -52,9 +51,9 @@ def main(argv: list[str] | None = None) -> int:
     """Run a command or stage and return its exit code; report a user error in one line, with exit code 2."""
     command, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if command in ("-h", "--help", "--version"):
-        from pipeline import __version__  # noqa: PLC0415  (nothing of the package is needed before)
+        from pipeline.core.version import VERSION  # noqa: PLC0415  (nothing else is needed)
 
-        print(f"imu-calibration {__version__}" if command == "--version" else _help(stages="--all" in rest))
+        print(f"imu-calibration {VERSION}" if command == "--version" else _help(stages="--all" in rest))
         return 0
     if command == "job-server":  # started by workflow/rules/common.smk
         import socket  # noqa: PLC0415
@@ -79,7 +78,7 @@ def run_command(words: list[str]) -> int:
     try:
         if command in COMMANDS:
             module, function = COMMANDS[command]
-            return int(getattr(import_module(f"pipeline.app.commands.{module}"), function)(rest))
+            return int(getattr(import_module(module), function)(rest))
         return int(import_module("pipeline.app.steps.batch").main(command, rest))
     except PipelineError as error:
         print(f"{PROGRAM} {command}: {error}", file=sys.stderr)

@@ -1,8 +1,8 @@
 """Calibrate one unit: the chain of its steps, in memory or, one rule of the workflow for each, through files.
 
 A step is a function of its inputs and of the settings that it reads. A run loads the inputs of a step from the files of
-earlier jobs (``pipeline.app.steps.unit_files``), calls ``run_step``, and stores the result. ``run_steps`` calls all steps
-of a unit in memory; ``pipeline.calibrate``, the commands, the study and the tests use it.
+earlier jobs (``pipeline.app.steps.unit_files``), calls ``run_step``, and stores the result. ``run_steps`` calls all
+steps of a unit in memory; ``pipeline.calibrate``, the commands, the study and the tests use it.
 """
 
 from __future__ import annotations

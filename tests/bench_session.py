@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import lfilter
 
+from pipeline.core.records import AXES, Motion, Recording
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import truth
-from pipeline.core.records import AXES, Motion, Recording
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.sensor import ALTERATIONS, Scene, alter
 from pipeline.simulation.session import Environment

@@ -14,11 +14,11 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from unit_settings import settings_of, with_noise
 
+from pipeline.core.records import Recording
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.chip_fit import Chip
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.stages import fit_stage
-from pipeline.core.records import Recording
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:

@@ -19,7 +19,6 @@ from stage_files import write_pack
 from pipeline.app.config import load_campaign
 from pipeline.app.config.campaign import UnitRow
 from pipeline.app.config.owner import check_owner, claim, complete_record
-from pipeline.core.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch
 from pipeline.app.results_folder import (
     NEW_FOLDER,
     PUBLISHED_PATHS,
@@ -32,6 +31,7 @@ from pipeline.app.results_folder import (
     take_run,
 )
 from pipeline.app.steps import gather
+from pipeline.core.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch
 
 if TYPE_CHECKING:
     from pathlib import Path

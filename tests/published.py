@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.evaluation.diagnosis.diagnose import diagnose as diagnosis_of
 from pipeline.core.records import Candidate, Noise, SensorValidation, StepErrors, Validation
+from pipeline.evaluation.diagnosis.diagnose import diagnose as diagnosis_of
 from pipeline.evaluation.held_out import heldout
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from pipeline.output.exports import exports
-from pipeline.ingest.arrow import from_parquet, to_parquet
 from pipeline.core.pack import Pack, as_bytes, new_pack
+from pipeline.ingest.arrow import from_parquet, to_parquet
+from pipeline.output.exports import exports
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

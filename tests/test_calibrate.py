@@ -15,23 +15,23 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import imu_calibration.errors
+import imu_calibration.core.errors
 import imu_calibration.unit
 import numpy as np
 import pandas as pd
 import pytest
 from hydra import initialize
 from hydra.core.global_hydra import GlobalHydra
-from imu_calibration.model.effects import catalogue as same_catalogue
+from imu_calibration.physics.effects import catalogue as same_catalogue
 
 import pipeline
 import pipeline.unit
 from pipeline.app.commands import apply, simulate
 from pipeline.app.config import load_campaign
-from pipeline.core.errors import InputError, InternalError
-from pipeline.physics.effects import catalogue
 from pipeline.app.one_unit import ConfiguredUnit, notes_of_campaign
+from pipeline.core.errors import InputError, InternalError
 from pipeline.core.verdicts import Verdict
+from pipeline.physics.effects import catalogue
 
 if TYPE_CHECKING:
     from pipeline.app.result import UnitResult
@@ -355,7 +355,7 @@ def test_effects_of_a_campaign_and_of_a_python_file_stay_with_their_unit(campaig
 
 SQUEEZED = """
 import numpy as np
-from imu_calibration.model.effects.base import Effect, Layout, Owner, axis_parameters
+from imu_calibration.physics.effects.base import Effect, Layout, Owner, axis_parameters
 
 class Squeezed(Effect):
     name = "squeezed"
@@ -441,7 +441,7 @@ def test_imu_calibration_is_the_same_package() -> None:
     assert imu_calibration.calibrate is pipeline.calibrate
     assert callable(pipeline.calibrate)  # also once pipeline.unit is imported: no module has the name of a function
     assert sys.modules["imu_calibration.unit"] is pipeline.unit
-    assert sys.modules["imu_calibration.errors"].PipelineError is pipeline.PipelineError
+    assert sys.modules["imu_calibration.core.errors"].PipelineError is pipeline.PipelineError
     assert same_catalogue is catalogue
     assert pipeline.unit.__spec__.name == pipeline.unit.__name__ == "pipeline.unit"
     with pytest.raises(ModuleNotFoundError, match=r"pipeline\.nothing"):

@@ -113,7 +113,7 @@ def test_the_options_of_commands_exist(document: Path, monkeypatch: pytest.Monke
             if rest:
                 module, function = COMMANDS[name]
                 with pytest.raises(Parsed):
-                    getattr(import_module(f"pipeline.app.commands.{module}"), function)(rest)
+                    getattr(import_module(module), function)(rest)
             else:
                 assert name in COMMANDS
         elif words[0] == "snakemake" and "--config" in words:

@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from fake_runs import as_of_version_1, campaign_of, run, sha256, units_of, write_campaign
 
-from pipeline import files, results_folder
+from pipeline.app import results_folder
 from pipeline.app.commands import unpack
 from pipeline.app.config.owner import OtherCampaignError, check_owner
+from pipeline.app.results_folder import BusyError, finish_publishing, read_owner, release_locks, take_run, unit_of
+from pipeline.core import files
 from pipeline.core.errors import MissingInputError
 from pipeline.core.pack import PACKS, Pack
-from pipeline.app.results_folder import BusyError, finish_publishing, read_owner, release_locks, take_run, unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

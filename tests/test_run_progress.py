@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import run_progress
+from pipeline.app import run_progress
 from pipeline.app.results_folder import BusyError, hold_as_job, jobs_running, release_locks, take_run
 from pipeline.app.run_progress import Progress, _cause, duration
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import jinja2
 import pytest
 
-from pipeline import user_cache
+from pipeline.core import user_cache
 from pipeline.core.compiled_templates import CompiledTemplates
 from pipeline.core.user_cache import cache_folder, from_cache, to_cache
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.estimation.noise import with_noises
 from pipeline.core.settings import SECTIONS, DataSheet, Filter, Ingest, Procedure, Section, Sensor, Settings, Table
+from pipeline.estimation.noise import with_noises
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.physics.kinematics import LEVEL_AT_ZERO
 from pipeline.app.planning.guide import in_words
+from pipeline.physics.kinematics import LEVEL_AT_ZERO
 from pipeline.physics.signal.rests import SETTLING_S
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.trajectory import rotation_about

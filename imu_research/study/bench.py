@@ -40,17 +40,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
+from imu_research.study.cases import COURSES, INTERVAL_BY_HAND_S, INTERVAL_S, StudyCase
+from pipeline.core.records import SENSORS, Recording, Values
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gates import min_gain
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.base import truth
 from pipeline.physics.kinematics import reference_motion
-from pipeline.core.records import SENSORS, Recording, Values
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
 from pipeline.simulation.session import Streams, random_environment
-from imu_research.study.cases import COURSES, INTERVAL_BY_HAND_S, INTERVAL_S, StudyCase
 
 if TYPE_CHECKING:
     from collections.abc import Callable

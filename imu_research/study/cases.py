@@ -31,10 +31,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.uncertainty_budget import DITHERED
 from pipeline.core.files import CONFIGS
-from pipeline.physics.effects import effect
 from pipeline.core.records import SENSORS, Values
+from pipeline.estimation.uncertainty_budget import DITHERED
+from pipeline.physics.effects import effect
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:

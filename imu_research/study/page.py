@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.physics.effects import effect
-from pipeline.output.pages.pages import template
 from imu_research.study.cases import FAINT, SIZES
 from imu_research.study.scores import (
     GATES,
@@ -27,6 +25,8 @@ from imu_research.study.scores import (
     wilson,
 )
 from pipeline.core.verdicts import Verdict
+from pipeline.output.pages.pages import template
+from pipeline.physics.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -21,22 +21,22 @@ from dataclasses import replace
 from multiprocessing import get_context
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.app.config import code_digest
-from pipeline.core.errors import CannotCalibrateError, ConfigurationError, PipelineError
-from pipeline.estimation.stages import stage_module
-from pipeline.physics.effects import leaving_out
-from pipeline.app.one_unit import unit_of_recordings, unit_row
-from pipeline.core.records import SENSORS, NotCalibrated
 from imu_research.study.bench import at_detection, recordings_of, signals_left
 from imu_research.study.cases import METHODS, StudyCase, draw
+from pipeline.app.config import code_digest
+from pipeline.app.one_unit import unit_of_recordings, unit_row
+from pipeline.core.errors import CannotCalibrateError, ConfigurationError, PipelineError
+from pipeline.core.records import SENSORS, NotCalibrated
+from pipeline.estimation.stages import stage_module
+from pipeline.physics.effects import leaving_out
 from pipeline.unit import STEPS, tasks_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from pipeline.core.files import JSON
     from pipeline.app.one_unit import ConfiguredUnit
+    from pipeline.core.files import JSON
     from pipeline.unit import UnitState
 
 

@@ -17,11 +17,11 @@ import numpy as np
 import pandas as pd
 import scipy
 
+from pipeline.core.verdicts import Verdict
 from pipeline.estimation.free_curves import OTHER_PREFIX
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW
-from pipeline.physics.effects import effect
 from pipeline.output.pages.chart import Dots, Figure, LineMark, Panel, chart
-from pipeline.core.verdicts import Verdict
+from pipeline.physics.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

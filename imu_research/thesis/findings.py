@@ -33,8 +33,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.physics.effects.base import STANDARD_GRAVITY
-from pipeline.output.pages.comparison import MeanWithUncertainty, mean_of
 from imu_research.thesis.seeds import CAUSES, INTERVAL_S, LOST, TIME_CONSTANT_S
 from imu_research.thesis.tables import (
     ACCELEROMETER,
@@ -50,6 +48,8 @@ from imu_research.thesis.tables import (
     read_printed,
     values,
 )
+from pipeline.output.pages.comparison import MeanWithUncertainty, mean_of
+from pipeline.physics.effects.base import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -16,14 +16,6 @@ import numpy as np
 import pandas as pd
 
 from imu_logs.yaml_file import read_yaml
-from pipeline.core.records import SENSOR_UNITS
-from pipeline.core.records.correction import corrected, steps_of
-from pipeline.output.pages.chart import AXES_LEGEND, Figure, Panel, SampleMarks, chart
-from pipeline.output.pages.group_charts import Point, curves, stems
-from pipeline.output.pages.held_out_section import held_out_over_time
-from pipeline.output.pages.numbers import MINUS, NOTHING, number
-from pipeline.output.pages.pages import template
-from pipeline.simulation.description import shipped_settings
 from imu_research.thesis.findings import CSS_CLASSES, Errors, agreements, conclusions, evidence, scatters, verdict_of
 from imu_research.thesis.seeds import CAUSES, device_of
 from imu_research.thesis.tables import (
@@ -37,7 +29,15 @@ from imu_research.thesis.tables import (
     in_words,
     read_printed,
 )
+from pipeline.core.records import SENSOR_UNITS
+from pipeline.core.records.correction import corrected, steps_of
 from pipeline.evaluation.held_out.samples import samples_of_motion
+from pipeline.output.pages.chart import AXES_LEGEND, Figure, Panel, SampleMarks, chart
+from pipeline.output.pages.group_charts import Point, curves, stems
+from pipeline.output.pages.held_out_section import held_out_over_time
+from pipeline.output.pages.numbers import MINUS, NOTHING, number
+from pipeline.output.pages.pages import template
+from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

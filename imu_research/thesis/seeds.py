@@ -29,20 +29,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from imu_research.thesis.tables import AXES, DEVICES, SILENT
+from pipeline.core.records import SENSORS, Mask, NotCalibrated, Recording, Values
+from pipeline.core.records.correction import corrected
 from pipeline.estimation.accelerometer import staged as accelerometer
 from pipeline.estimation.gyroscope import cholesky_lu
 from pipeline.estimation.gyroscope import staged as gyroscope
+from pipeline.evaluation.held_out.samples import samples_of_motion
 from pipeline.physics.measurement import linear_truth
-from pipeline.core.records import SENSORS, Mask, NotCalibrated, Recording, Values
-from pipeline.core.records.correction import corrected
 from pipeline.physics.signal.filters import apply_filter
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import Description, UnitDescription, read_description, shipped_settings
 from pipeline.simulation.sensor import SimulatedSensor, bias_wander
 from pipeline.simulation.session import received
-from imu_research.thesis.tables import AXES, DEVICES, SILENT
 from pipeline.unit import run_checked
-from pipeline.evaluation.held_out.samples import samples_of_motion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

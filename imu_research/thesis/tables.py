@@ -17,12 +17,12 @@ import numpy as np
 import pandas as pd
 from scipy.integrate import cumulative_trapezoid
 
+from pipeline.app.steps.unit_files import recordings_of
 from pipeline.core.pack import Pack, read_published
 from pipeline.core.records import Noise, Recording, Values
+from pipeline.evaluation.held_out.samples import samples_of_motion
 from pipeline.physics.signal.rests import find_rests
 from pipeline.simulation.description import shipped_settings
-from pipeline.app.steps.unit_files import recordings_of
-from pipeline.evaluation.held_out.samples import samples_of_motion
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

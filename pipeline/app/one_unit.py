@@ -21,13 +21,20 @@ from pipeline.app.config.layers import as_list, key_of
 from pipeline.app.config.options import RUN_SETTINGS, Problem, nearest, parse
 from pipeline.app.config.stage_settings import as_job_reads, settings_in_memory
 from pipeline.app.config.user_effects import PYTHON
-from pipeline.core.errors import ConfigurationError, InputError, MissingInputError, PipelineError, as_published, failure_of
+from pipeline.core.errors import (
+    ConfigurationError,
+    InputError,
+    MissingInputError,
+    PipelineError,
+    as_published,
+    failure_of,
+)
+from pipeline.core.settings import UserEffectFiles
 from pipeline.ingest.files import candidate_files, wrong_name
 from pipeline.ingest.read import IN_MEMORY, of_one_sensor, tried
 from pipeline.ingest.recordings_sheet import SHEET, sheet_of_mapping, with_sheet
-from pipeline.physics.effects import registered
 from pipeline.output.outcome import run_command
-from pipeline.core.settings import UserEffectFiles
+from pipeline.physics.effects import registered
 from pipeline.unit import Task, UnitFiles, UnitState, run_steps, tasks_of
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ import numpy as np
 from imu_logs.units import CANONICAL, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.core.errors import InputError
 from pipeline.core.files import write_atomically
-from pipeline.ingest.axis_maps import in_body_axes, maps_of_log
-from pipeline.physics.compensation import Compensation, compensation_of
 from pipeline.core.pack import as_bytes
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Values
+from pipeline.ingest.axis_maps import in_body_axes, maps_of_log
+from pipeline.physics.compensation import Compensation, compensation_of
 from pipeline.unit import Task, UnitState, run_step
 
 if TYPE_CHECKING:

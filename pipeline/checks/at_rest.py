@@ -36,9 +36,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imu_logs.units import TRIADS
-from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.checks.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, refusal
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Note, median
+from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.signal.rests import RATE_AT_REST, RATE_AT_REST_DPS, rests_from_table, runs
 
 if TYPE_CHECKING:

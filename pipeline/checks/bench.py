@@ -53,18 +53,18 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.core.errors import IngestError
+from pipeline.core.records import AXES
 from pipeline.ingest.axis_maps import axis_matrix
 from pipeline.ingest.gravity_rotation import FAILS_DEG, MAX_ROTATION_SAMPLES, MIN_MEDIAN_MOVES, misfits_deg, moves_of
 from pipeline.physics.kinematics import UP_AT_ZERO
-from pipeline.core.records import AXES
 from pipeline.physics.signal.rests import still_samples
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.ingest.gravity_rotation import MoveByHand
     from pipeline.core.records import Recording, Values
     from pipeline.core.settings import RecordingFile, Table
+    from pipeline.ingest.gravity_rotation import MoveByHand
 
 MIN_ANGLE_SAMPLES = 10  # samples, five times the unknowns of an angle
 UP_AT_QUARTER_TURN = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg

@@ -8,8 +8,8 @@ within 8 rows of the one before. By chance the probability is
 
     (8 c / n)^19,   c : rows that occur in both,   n : rows of the longer recording
 
-and its limit is 10^-6, as for stuck readings (``pipeline.ingest.quality_flags``). This detects whole copies, copies shifted
-in rows or time, cut copies, and copies with rows left out.
+and its limit is 10^-6, as for stuck readings (``pipeline.ingest.quality_flags``). This detects whole copies, copies
+shifted in rows or time, cut copies, and copies with rows left out.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imu_logs.units import TRIADS
-from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
-from pipeline.physics.kinematics import normal_gravity_g
 from pipeline.checks.at_rest import check_axes, check_static, with_rates_at_rest
 from pipeline.checks.coarse_temperature import refined
 from pipeline.checks.evidence import place, refusal
 from pipeline.checks.mounting import check_mounting
 from pipeline.checks.reference import check_motion, check_turns
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Note
+from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
+from pipeline.physics.kinematics import normal_gravity_g
 from pipeline.physics.signal.quiet_motion import coarse_steps
 
 if TYPE_CHECKING:

@@ -13,8 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import IngestError
+from pipeline.core.records import (
+    AXES,
+    SENSORS,
+    conjugate_product,
+    continuous,
+    median,
+    noise_of_steps,
+    once,
+    once_of_log,
+)
 from pipeline.ingest.quality_flags import GAP_INTERVALS
-from pipeline.core.records import AXES, SENSORS, conjugate_product, continuous, median, noise_of_steps, once, once_of_log
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -14,9 +14,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.errors import IngestError
-from pipeline.ingest.axis_maps import STRAIGHT, axis_maps, axis_matrix
-from pipeline.physics.kinematics import UP_AT_ZERO
 from pipeline.checks.bench import (
     UP_AT_QUARTER_TURN,
     as_map,
@@ -35,7 +32,10 @@ from pipeline.checks.bench import (
     usual_up,
 )
 from pipeline.checks.seats import TurnRecording, refined_zeros, seat_notes
+from pipeline.core.errors import IngestError
 from pipeline.core.records import AXES, Note, level_in_body
+from pipeline.ingest.axis_maps import STRAIGHT, axis_maps, axis_matrix
+from pipeline.physics.kinematics import UP_AT_ZERO
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -48,8 +48,8 @@ from pipeline.core.records import MEDIAN_SIZE
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.core.errors import IngestError
     from pipeline.checks.evidence import ChannelLimits
+    from pipeline.core.errors import IngestError
     from pipeline.core.records import Mask, Recording, Values
     from pipeline.core.settings import Table
 

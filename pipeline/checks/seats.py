@@ -28,10 +28,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.physics.effects import effect
-from pipeline.physics.kinematics import UP_AT_ZERO, level_at_zero, skew, turn_about_axis, turn_by_vector
 from pipeline.checks.bench import UP_AT_QUARTER_TURN, angle_ahead, by_convention, unit
 from pipeline.core.records import AFTER_BASE, AXES, BASE_COUNT, MATRIX_NAMES, Note, motion_at_rest
+from pipeline.physics.effects import effect
+from pipeline.physics.kinematics import UP_AT_ZERO, level_at_zero, skew, turn_about_axis, turn_by_vector
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

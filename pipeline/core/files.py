@@ -23,7 +23,7 @@ JSON: TypeAlias = dict[str, Any]  # a document, or a part of one
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-_PACKAGE = Path(__file__).resolve().parent
+_PACKAGE = Path(__file__).resolve().parents[1]
 INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
 SHIPPED = _PACKAGE / "shipped" if INSTALLED else _PACKAGE.parent  # holds Snakefile, workflow, configs, data
 CONFIGS = SHIPPED / "configs"

@@ -10,10 +10,10 @@ import re
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from imu_logs.units import SENSORS
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-SENSORS = ("accelerometer", "gyroscope")
 
 
 class Verdict(StrEnum):

@@ -4,8 +4,8 @@
 
 with the linear map A of the fit from its readings (``pipeline.estimation.engine``) or equations to its parameters, and
 the column z of parameter j of the effect. Where the recordings leave the effect open
-(``pipeline.evaluation.diagnosis.observability``), the largest change is not in the expanded uncertainty: the calibration states it
-apart (``pipeline.physics.open_effects``).
+(``pipeline.evaluation.diagnosis.observability``), the largest change is not in the expanded uncertainty: the
+calibration states it apart (``pipeline.physics.open_effects``).
 
 An error of the accelerometer by hand changes the direction of gravity, to which the moves of the gyroscope refer:
 
@@ -26,25 +26,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.records import BASE, BIAS, matrix_of
 from pipeline.estimation.candidates import limits_of
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.multi_position.model import motion_of
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Owner
-from pipeline.core.records import BASE, BIAS, matrix_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
+    from pipeline.core.records import Motion, SensorCalibration, Values
+    from pipeline.core.settings import DataSheet
     from pipeline.estimation.engine import LinearMap
     from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
     from pipeline.estimation.multi_position.model import Model
     from pipeline.estimation.table_errors import Reference
     from pipeline.physics.effects.base import Effect
-    from pipeline.core.records import Motion, SensorCalibration, Values
-    from pipeline.core.settings import DataSheet
 
 OWNERS = (Owner.SENSOR, Owner.RECORDING)  # errors of place, table and timing have lines of their own in the budget
 OF_ACCELEROMETER = "accelerometer."  # before an effect of the accelerometer that changes the gyroscope's parameters

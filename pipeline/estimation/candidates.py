@@ -18,10 +18,10 @@ from pipeline.physics.effects.mounting import SETUP_EFFECTS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.observations import Observations
-    from pipeline.physics.effects.base import Effect
     from pipeline.core.records import Motion, Recording, SensorCalibration, Values
     from pipeline.core.settings import DataSheet, Settings, Table
+    from pipeline.estimation.observations import Observations
+    from pipeline.physics.effects.base import Effect
 
 AUTO = "auto"  # instead of a list of effects: the effects that the diagnosis selects
 MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"

@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import MEDIAN_SIZE, SENSORS, Mask, Recording, SensorCalibration, Values, noise_of_steps
 from pipeline.estimation.engine import LinearMap, scaled_inverse
 from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.estimation.noise import noise_of, wander_prior
@@ -21,7 +22,6 @@ from pipeline.estimation.observations import BIAS_BLOCKS, SHORTEST_BLOCK_S
 from pipeline.physics.compensation import Compensation
 from pipeline.physics.effects.base import STANDARD_GRAVITY
 from pipeline.physics.kinematics import skew, turn_by_vector
-from pipeline.core.records import MEDIAN_SIZE, SENSORS, Mask, Recording, SensorCalibration, Values, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -26,6 +26,16 @@ import numpy as np
 import scipy
 
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import (
+    AXES,
+    MATRIX,
+    SENSOR_UNITS,
+    SENSORS,
+    SensorCalibration,
+    Values,
+    coverage_factor,
+    standard_uncertainty,
+)
 from pipeline.estimation.chip_fit import (
     PRIORS,
     ROW_S,
@@ -42,16 +52,6 @@ from pipeline.estimation.engine import assess_noise, scaled_inverse
 from pipeline.estimation.gauss_markov import WanderPrior
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom, own_and_bench
 from pipeline.physics.kinematics import turn_by_vector
-from pipeline.core.records import (
-    AXES,
-    MATRIX,
-    SENSOR_UNITS,
-    SENSORS,
-    SensorCalibration,
-    Values,
-    coverage_factor,
-    standard_uncertainty,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -25,19 +25,19 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from pipeline.core.errors import InputError, NotObservableError
+from pipeline.core.records import BASE_COUNT, MATRIX_ROWS, motion_at_rest
 from pipeline.estimation.engine import LinearMap, scaled_inverse
 from pipeline.estimation.gauss_markov import Products, Setting
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.observations import without_rows
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.physics.effects.base import Effect, Layout, truth
-from pipeline.core.records import BASE_COUNT, MATRIX_ROWS, motion_at_rest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from pipeline.estimation.observations import Observations, RecordingRows
     from pipeline.core.records import Index, Motion, Noise, Values
+    from pipeline.estimation.observations import Observations, RecordingRows
 
 REMEMBERED = 4  # motions of a part after effects of timing: of the base, and of terms without their own effect
 # singular value of unit columns that is determined; share of its vector

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import SensorCalibration
 from pipeline.estimation.candidates import AUTO, MOUNTING, configured_effects, offered
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.observations import observe
@@ -12,12 +13,11 @@ from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
 from pipeline.estimation.stages import FitStage
 from pipeline.physics.effects import bench_priors, effect, stated_priors
-from pipeline.core.records import SensorCalibration
 
 if TYPE_CHECKING:
-    from pipeline.estimation.stages import Change
     from pipeline.core.records import UnitRecordings
     from pipeline.core.settings import Settings
+    from pipeline.estimation.stages import Change
 
 ALL: tuple[Change, ...] = ("bias", "matrix", "effects")
 FIT_STAGES = {"effects": FitStage(changes=ALL, accepts=("readings", *ALL), free=True, reference=True)}

@@ -31,8 +31,8 @@ import numpy as np
 import scipy
 
 from pipeline.core.errors import NotObservableError
-from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting, WanderPrior
 from pipeline.core.records import Index, Values, noise_of_steps
+from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting, WanderPrior
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

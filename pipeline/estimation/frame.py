@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.candidates import MOUNTING
 from pipeline.core.records import AXES, coverage_factor
+from pipeline.estimation.candidates import MOUNTING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

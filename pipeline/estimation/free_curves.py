@@ -22,7 +22,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
-from pipeline.physics.effects.base import Effect, EffectParameter, Layout, Owner, axis_parameters, length, truth, unit_of
+from pipeline.physics.effects.base import (
+    Effect,
+    EffectParameter,
+    Layout,
+    Owner,
+    axis_parameters,
+    length,
+    truth,
+    unit_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

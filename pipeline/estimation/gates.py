@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.physics.effects import effect
 from pipeline.core.records import coverage_factor
+from pipeline.physics.effects import effect
 
 if TYPE_CHECKING:
+    from pipeline.core.records import Values
     from pipeline.estimation.ranking import Score
     from pipeline.physics.effects.base import Effect
-    from pipeline.core.records import Values
 
 MIN_DELTA_BIC = 10.0  # "very strong" evidence (Raftery, Sociological Methodology 25, 1995)
 MIN_DELTA_BIC_OF_SLOW = 16.0  # of a slow effect, see above

@@ -23,6 +23,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import (
+    AFTER_BASE,
+    BASE,
+    BASE_COUNT,
+    BASE_NAMES,
+    BIAS,
+    MATRIX,
+    NORMAL,
+    Contribution,
+    Noise,
+    Recording,
+    SensorCalibration,
+    StageResult,
+    Values,
+    base_values,
+    matrix_of,
+)
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed, parameter_names, require_available, starts_of
 from pipeline.estimation.design import (
     Design,
@@ -50,23 +67,6 @@ from pipeline.estimation.uncertainty_budget import (
 )
 from pipeline.physics.effects.base import Layout, truth
 from pipeline.physics.effects.mounting import Mounting, errors_in_mean_frame, in_mean_frame
-from pipeline.core.records import (
-    AFTER_BASE,
-    BASE,
-    BASE_COUNT,
-    BASE_NAMES,
-    BIAS,
-    MATRIX,
-    NORMAL,
-    Contribution,
-    Noise,
-    Recording,
-    SensorCalibration,
-    StageResult,
-    Values,
-    base_values,
-    matrix_of,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

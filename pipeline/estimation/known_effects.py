@@ -16,9 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError
-from pipeline.estimation.uncertainty_budget import with_uncertainty
-from pipeline.physics.effects.base import with_truth
-from pipeline.physics.measurement import SensorEffects, compensate
 from pipeline.core.records import (
     BASE_NAMES,
     FittedEffect,
@@ -30,6 +27,9 @@ from pipeline.core.records import (
     Values,
     motion_at_rest,
 )
+from pipeline.estimation.uncertainty_budget import with_uncertainty
+from pipeline.physics.effects.base import with_truth
+from pipeline.physics.measurement import SensorEffects, compensate
 from pipeline.physics.signal.filters import temperature_of
 
 if TYPE_CHECKING:

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.records import Estimate, FittedEffect, SensorCalibration, StageResult
 from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.stages import FitStage
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
-from pipeline.core.records import Estimate, FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
     from pipeline.core.records import UnitRecordings

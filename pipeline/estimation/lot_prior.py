@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from pipeline.core.records import MEDIAN_SIZE, Index, Mask, Values
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
-from pipeline.core.records import MEDIAN_SIZE, Index, Mask, Values
 
 MIN_SIBLINGS = 8  # siblings; docs/fleet.md has the errors and intervals in lots of 12 units
 # largest share of a lot without the prior by chance, without harm: measured 0.8 to 2.4 % (benchmarks/lot_prior.py)

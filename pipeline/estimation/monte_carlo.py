@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipeline.estimation.engine import ErrorMixture, draw_normal
 from pipeline.core.records import AFTER_BASE, BIAS, MATRIX, MonteCarlo
+from pipeline.estimation.engine import ErrorMixture, draw_normal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

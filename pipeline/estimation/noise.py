@@ -8,10 +8,10 @@ the noise:
 1. ``static``: a long rest. Temperature and warm-up, which would look like wander, are regressed out. The scatter within
    the rests of the other recordings is also used for the white noise, if it agrees.
 2. ``rests``: the rests of the other recordings, each with a separate mean. In recordings by hand the unit creeps
-   (``pipeline.physics.signal.quiet_motion``): gravity moves from one axis to another, which is not wander of a bias. The
-   accelerometer's wander is then estimated from the component along gravity, and its white noise from the scatter about
-   a parabola in time. A hand trembles in place: the integral of its rate is bounded. So the correlation time is at most
-   the length of a rest. With the 100 s of a sensor file, a tremor of 0.4 deg/s would be a wander of 1 deg/s.
+   (``pipeline.physics.signal.quiet_motion``): gravity moves from one axis to another, which is not wander of a bias.
+   The accelerometer's wander is then estimated from the component along gravity, and its white noise from the scatter
+   about a parabola in time. A hand trembles in place: the integral of its rate is bounded. So the correlation time is
+   at most the length of a rest. With the 100 s of a sensor file, a tremor of 0.4 deg/s would be a wander of 1 deg/s.
 3. ``residual``: the scatter of windows of 16 samples in turns about a local polynomial: white noise only. With P the
    projection that removes the polynomial and R the autocovariance of the filter, ``median(|P y|^2) = white^2 tr(P R)
    (1 - 2/(9 nu))^3``, where ``nu = tr(P R)^2 / tr(P R P R)`` (Satterthwaite 1946; the median is robust against windows
@@ -53,6 +53,16 @@ import numpy as np
 import scipy
 
 from pipeline.core.errors import ConfigurationError, InputError
+from pipeline.core.records import (
+    NOISE_OF_ROWS,
+    SENSORS,
+    Noise,
+    Recording,
+    UnitRecordings,
+    WanderLikelihood,
+    median,
+    noise_of_steps,
+)
 from pipeline.estimation.gauss_markov import (
     MAX_PRIOR_WIDTHS,
     SHARPEST_WIDTH,
@@ -65,16 +75,6 @@ from pipeline.estimation.gauss_markov import (
     fast,
     orthonormal,
     variance_of_average,
-)
-from pipeline.core.records import (
-    NOISE_OF_ROWS,
-    SENSORS,
-    Noise,
-    Recording,
-    UnitRecordings,
-    WanderLikelihood,
-    median,
-    noise_of_steps,
 )
 from pipeline.physics.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
 from pipeline.physics.signal.quiet_motion import coarse_steps, component_along_gravity, creep_of_readings

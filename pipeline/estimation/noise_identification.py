@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import scipy
 
+from pipeline.core.records import AXES, SENSOR_UNITS, SENSORS
 from pipeline.estimation.noise_search import (
     ONE_SIDED,
     QUANTILE,
@@ -46,17 +47,16 @@ from pipeline.estimation.noise_terms import (
     spectrum_of,
     unit_of,
 )
-from pipeline.core.records import AXES, SENSOR_UNITS, SENSORS
 from pipeline.physics.signal.filters import temperature_of
 from pipeline.physics.signal.rests import rest_readings, usable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.noise_search import FittedComposition
-    from pipeline.estimation.noise_terms import Spectrum
     from pipeline.core.files import JSON
     from pipeline.core.records import Recording, Values
+    from pipeline.estimation.noise_search import FittedComposition
+    from pipeline.estimation.noise_terms import Spectrum
 
 
 MIN_SPECTRUM_SAMPLES = 60  # which determine the white noise to a tenth

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.records import median
 from pipeline.estimation.noise_terms import (
     LONGEST_TIME,
     MARKOV,
@@ -45,13 +46,12 @@ from pipeline.estimation.noise_terms import (
     solved,
     spectrum_of,
 )
-from pipeline.core.records import median
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from pipeline.estimation.noise_terms import Spectrum, Work
     from pipeline.core.records import Values
+    from pipeline.estimation.noise_terms import Spectrum, Work
 
 MOST_MARKOV = 2  # processes of different correlation times; to distinguish a third takes some 10^6 samples
 TIMES_SCORED = 10  # correlation times whose score is computed, in equal steps of their logarithm

@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.core.records import once, once_of_log
 from pipeline.estimation.gauss_markov import Blocks, constant_bias_s, information
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.estimation.turns import RowGroups, reference_valid, rows_of
 from pipeline.physics.effects import stated_priors
 from pipeline.physics.effects.base import turning_direction
 from pipeline.physics.kinematics import earth_of, table_motion
-from pipeline.core.records import once, once_of_log
 from pipeline.physics.signal.encoder_rate import rate_by_angle
 from pipeline.physics.signal.filters import filtered, impulse_response
 

@@ -34,8 +34,8 @@ from pipeline.estimation.selection import DELAYS
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from pipeline.physics.effects.base import Effect
     from pipeline.core.records import Values
+    from pipeline.physics.effects.base import Effect
 
 INCLUSION = 0.02  # prior probability of each effect
 FIRST_VERSION_AND_SCALE = 0, 3  # version and scale at which the search for the best ones of a set begins

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.records import BASE_COUNT
 from pipeline.estimation.candidates import SECOND, SECOND_SHARE, time_constants
 from pipeline.estimation.design import Design, EffectColumns, placed
 from pipeline.estimation.evidence import CandidateProblem, linear_problem
@@ -20,13 +21,12 @@ from pipeline.estimation.generalized_least_squares import JointFit, design_at, f
 from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import MIN_NEW_COLUMN_SHARE, without
 from pipeline.estimation.selection import DELAYS, Selection
-from pipeline.core.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from pipeline.physics.effects.base import Effect
     from pipeline.core.records import Values
+    from pipeline.physics.effects.base import Effect
 
 
 WORTH_A_FIT = 0.01  # probability of the sets with the same other timing effects, above which these are fitted

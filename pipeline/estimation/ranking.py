@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from pipeline.core.records import BASE_COUNT, standard_uncertainty
 from pipeline.estimation.design import Design, EffectColumns, Start
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
-from pipeline.core.records import BASE_COUNT, standard_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from pipeline.estimation.observations import Observations
     from pipeline.core.records import Index, Values
+    from pipeline.estimation.observations import Observations
 
 MIN_NEW_COLUMN_SHARE = 1e-3  # share of a column's norm, after projection of the base, from which on it is determined
 # the same of the variance of a candidate's weakest direction, after projection of the selected effects

@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, NotObservableError
+from pipeline.core.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageResult, Values
 from pipeline.estimation.candidates import bench_effects
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.generalized_least_squares import fit_joint
@@ -42,7 +43,6 @@ from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, settled,
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
 from pipeline.physics.effects import stated_priors
 from pipeline.physics.effects.base import truth
-from pipeline.core.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageResult, Values
 from pipeline.physics.signal.filters import filtered
 
 if TYPE_CHECKING:

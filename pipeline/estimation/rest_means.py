@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError
+from pipeline.core.records import NOISE_OF_ROWS, once
 from pipeline.estimation.turns import stop_and_go
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.physics.kinematics import table_motion
-from pipeline.core.records import NOISE_OF_ROWS, once
 from pipeline.physics.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
 from pipeline.physics.signal.quiet_motion import coarse_of, creep_of_rest, posterior_creep_rates, step_and_noise
 from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, usable

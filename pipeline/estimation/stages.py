@@ -31,7 +31,6 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError
-from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
 from pipeline.core.records import (
     BASE,
     NORMAL,
@@ -43,13 +42,14 @@ from pipeline.core.records import (
     StageResult,
     Values,
 )
+from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.engine import ResidualNoise
     from pipeline.core.records import FittedEffect, UnitRecordings
     from pipeline.core.settings import DataSheet, Method, Settings
+    from pipeline.estimation.engine import ResidualNoise
 
 GIVEN, GIVEN_SOURCE = "given", "given calibration"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null

@@ -23,15 +23,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.table_errors import TIME_BASE, type_b
-from pipeline.estimation.uncertainty_budget import (
-    GRAVITY,
-    NOT_STATED,
-    QUANTISATION_SOURCE,
-    clock_contribution,
-    with_uncertainty,
-)
-from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.core.records import (
     BIAS,
     MATRIX,
@@ -45,6 +36,15 @@ from pipeline.core.records import (
     SensorCalibration,
     Values,
 )
+from pipeline.estimation.table_errors import TIME_BASE, type_b
+from pipeline.estimation.uncertainty_budget import (
+    GRAVITY,
+    NOT_STATED,
+    QUANTISATION_SOURCE,
+    clock_contribution,
+    with_uncertainty,
+)
+from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.signal.filters import temperature_of
 
 if TYPE_CHECKING:

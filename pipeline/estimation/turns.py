@@ -18,9 +18,9 @@ from pipeline.physics.signal.rests import RATE_AT_REST_DPS, runs
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from pipeline.estimation.engine import ResidualNoise
     from pipeline.core.records import Index, Mask, Motion, Recording, Values
     from pipeline.core.settings import Table
+    from pipeline.estimation.engine import ResidualNoise
 
 
 FIT_BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings

@@ -21,10 +21,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.at_limits import changes_on_table
-from pipeline.estimation.candidates import TILT, tilt_like_zeros
-from pipeline.estimation.monte_carlo import through, with_trials
-from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 from pipeline.core.records import (
     AFTER_BASE,
     BASE_NAMES,
@@ -44,16 +40,20 @@ from pipeline.core.records import (
     base_values,
     standard_uncertainty,
 )
+from pipeline.estimation.at_limits import changes_on_table
+from pipeline.estimation.candidates import TILT, tilt_like_zeros
+from pipeline.estimation.monte_carlo import through, with_trials
+from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import ArrayLike
 
+    from pipeline.core.settings import Settings, Table
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.engine import LinearMap, ResidualNoise
     from pipeline.estimation.gauss_markov import WanderPrior
-    from pipeline.core.settings import Settings, Table
 
 # share of a variance, up to which a part of it may be chance: the lack of fit was 0 to 5 % on a table within its stated
 # accuracies, 18 to 73 % with 0.02 deg between its axes (12 simulated units each, 18 positions)

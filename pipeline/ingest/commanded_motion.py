@@ -3,8 +3,8 @@
     A(t) = P(tau),   r(t) = P'(tau),   tau = m_j + (1 + k) (t - t_j) + d_j       near move j
 
 with the commanded angle P, deg, at the program's time tau. The middle m_j of move j is at the sensor's time t_j by
-offset and drift of the whole program (``pipeline.ingest.clock_alignment``); d_j is the deviation of the move from that, s.
-The drift k during moves is separate, because pauses between moves would bias it.
+offset and drift of the whole program (``pipeline.ingest.clock_alignment``); d_j is the deviation of the move from that,
+s. The drift k during moves is separate, because pauses between moves would bias it.
 
 ``d_j`` and ``k`` are fitted to the readings w = a P'(tau) + b of the gyroscope near the move, so that pauses between
 moves may have any length. Lost steps of the motors are not observable; they are part of the table's accuracy.
@@ -19,10 +19,10 @@ import numpy as np
 
 from imu_logs.log import Log
 from imu_logs.units import TRIADS
-from pipeline.ingest.clock_alignment import fit_clocks
-from pipeline.ingest.encoder_log import seconds_of
 from pipeline.core.records import Note
 from pipeline.core.settings import ProgramRest, ProgramTurn, Repeated
+from pipeline.ingest.clock_alignment import fit_clocks
+from pipeline.ingest.encoder_log import seconds_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

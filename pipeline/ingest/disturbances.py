@@ -32,7 +32,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imu_logs.units import STANDARD_GRAVITY
-from pipeline.ingest.quality_flags import GAP
 from pipeline.core.records import (
     MEDIAN_SIZE,
     SENSOR_UNITS,
@@ -42,6 +41,7 @@ from pipeline.core.records import (
     median,
     noise_of_steps,
 )
+from pipeline.ingest.quality_flags import GAP
 
 if TYPE_CHECKING:
     from collections.abc import Callable

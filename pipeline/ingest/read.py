@@ -21,13 +21,13 @@ import imu_logs
 from imu_logs.profile import checks_of, csv_formats
 from imu_logs.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError, MissingInputError
+from pipeline.core.records import Note, Recording, files_of_readings, rate_of_attitude
 from pipeline.ingest.axis_maps import STRAIGHT, axis_maps, axis_matrix, in_body_axes, map_of_orientation
 from pipeline.ingest.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.ingest.encoder_log import unwrapped
 from pipeline.ingest.files import candidate_files
 from pipeline.ingest.quality_flags import examine
 from pipeline.ingest.recordings_sheet import require_recordings
-from pipeline.core.records import Note, Recording, files_of_readings, rate_of_attitude
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from imu_logs.units import SENSORS
 from pipeline.core.errors import InputError, shortened
 from pipeline.core.files import JSON, write_json
 
@@ -36,7 +37,6 @@ VALUES = "values"  # key of a state: the values of each configuration section
 DIGEST_DIGITS = 16  # of a digest
 MAX_VALUE_LENGTH = 60  # characters of a value; a longer one is cut and ends in its digest
 NAMED_CHANGES = 4  # changed values and recordings that a text names
-SENSORS = ("accelerometer", "gyroscope")
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,11 @@ import shlex
 from collections import Counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from imu_logs.units import SENSORS
 from pipeline.core.errors import shortened
 from pipeline.core.files import INSTALLED, JSON, read_json, text_of_cell
-from pipeline.output.history import SENSORS, difference, dropped, of_units, read_history
 from pipeline.core.verdicts import FAILED, KINDS, READY, SETTING, WITH_THEM, Verdict, problems, state_of
+from pipeline.output.history import difference, dropped, of_units, read_history
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -35,10 +35,6 @@ import numpy as np
 
 from imu_logs.files import not_regular
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError, shortened
-from pipeline.physics.checked import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
-from pipeline.physics.effects import effect_of
-from pipeline.physics.effects.base import parameter_limits
-from pipeline.physics.open_effects import OF_BUDGET, open_words
 from pipeline.core.pack import read_published
 from pipeline.core.records import (
     AXES,
@@ -51,13 +47,17 @@ from pipeline.core.records import (
     SensorCalibration,
     Values,
 )
+from pipeline.physics.checked import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
+from pipeline.physics.effects import effect_of
+from pipeline.physics.effects.base import parameter_limits
+from pipeline.physics.open_effects import OF_BUDGET, open_words
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.physics.checked import Check
     from pipeline.core.settings import DataSheet
+    from pipeline.physics.checked import Check
 
 # Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
 # (2 to 32 g), 32 between those of a gyroscope (125 to 4000 deg/s), 57 for rad/s, 1000 for mg and mdps.

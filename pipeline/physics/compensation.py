@@ -7,8 +7,8 @@ The effects are subtracted in three steps:
 
 1. Effects that depend on time and temperature only are subtracted once.
 2. Sensors whose effects depend on the truth that they change are solved by fixed point
-   (``pipeline.physics.measurement``). Where a sample needs the sample before it, as for an angular acceleration, it takes
-   that sample's value of the same iteration.
+   (``pipeline.physics.measurement``). Where a sample needs the sample before it, as for an angular acceleration, it
+   takes that sample's value of the same iteration.
 3. Effects that depend on the truth of the other sensor only are subtracted once.
 """
 
@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from pipeline.core.errors import InputError
+from pipeline.core.records import SENSORS, FittedEffect, Motion, SensorCalibration, Values
 from pipeline.physics.calibration_file import read_calibration, sample_covariance, sensor_of
 from pipeline.physics.effects import load_python_effect, register
 from pipeline.physics.effects.base import OF_THE_ROOM
 from pipeline.physics.log_motion import FIELDS_OF_SIGNALS, ExponentialRegression, LogEnd, fields_used, log_motion
 from pipeline.physics.measurement import SensorEffects, sensor_effects, solve, without_effects
-from pipeline.core.records import SENSORS, FittedEffect, Motion, SensorCalibration, Values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import InputError
-from pipeline.physics.encoder_trajectory import EncoderTrajectory
 from pipeline.core.records import AXES, Motion, Recording, Values, conjugate_product, continuous, once_of_log
+from pipeline.physics.encoder_trajectory import EncoderTrajectory
 from pipeline.physics.signal.encoder_rate import rate_by_angle
 from pipeline.physics.signal.filters import temperature_of
 from pipeline.physics.signal.rests import still_samples

@@ -25,9 +25,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, InputError
+from pipeline.core.records import FittedEffect, Motion, Values
 from pipeline.physics.effects import effect_of
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, turning_direction
-from pipeline.core.records import FittedEffect, Motion, Values
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

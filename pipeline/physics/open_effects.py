@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import shortened
-from pipeline.physics.effects import effect
 from pipeline.core.records import BASE, BASE_NAMES, base_values, matrix_of
 from pipeline.core.verdicts import WITH_THEM
+from pipeline.physics.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from imu_logs.units import SENSORS
 from pipeline.core.errors import ConfigurationError
-from pipeline.output.history import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

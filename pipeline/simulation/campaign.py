@@ -18,8 +18,8 @@ import numpy as np
 import pandas as pd
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.ingest.write import write_recording
 from pipeline.core.records import AXES, SENSORS
+from pipeline.ingest.write import write_recording
 from pipeline.simulation.description import course_of, shipped_settings
 from pipeline.simulation.procedures import ONE_RECORDING, plan
 from pipeline.simulation.sensor import decimals_of, drawn_effects, drawn_sensors

@@ -29,9 +29,9 @@ from pydantic.dataclasses import dataclass
 from imu_logs.yaml_file import read_yaml
 from pipeline.core.errors import ConfigurationError, MissingInputError
 from pipeline.core.files import CONFIGS
+from pipeline.core.settings import SECTIONS, Settings
 from pipeline.ingest.files import wrong_name
 from pipeline.physics.sensor_file import completed
-from pipeline.core.settings import SECTIONS, Settings
 from pipeline.simulation import REST_BY_HAND_S
 from pipeline.simulation.procedures import (
     FERRARIS,

@@ -18,8 +18,8 @@ from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationErr
 from pydantic.dataclasses import dataclass
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.ingest.commanded_motion import Program
 from pipeline.core.records import AXES
+from pipeline.ingest.commanded_motion import Program
 from pipeline.simulation.trajectory import (
     CommandedTurns,
     Gimbals,

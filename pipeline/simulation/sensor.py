@@ -37,9 +37,9 @@ mounting angles are within 1 deg (Sudsanguan 2019, chapter 3). A description may
     effects:
       gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: [0.03, 0.03, 0.03]}
 
-The keys are the keys of an effect's file (``pipeline.physics.effects.declaration``), of which only ``terms`` is required,
-and ``values``: the parameters' values, or one size; not needed where there are ``limits``. The effect is not in the
-catalogue of a diagnosis.
+The keys are the keys of an effect's file (``pipeline.physics.effects.declaration``), of which only ``terms`` is
+required, and ``values``: the parameters' values, or one size; not needed where there are ``limits``. The effect is not
+in the catalogue of a diagnosis.
 """
 
 from __future__ import annotations
@@ -51,18 +51,18 @@ import numpy as np
 import scipy
 
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.records import SENSORS, Motion
 from pipeline.physics.effects import effect, effect_from
 from pipeline.physics.effects.base import STANDARD_GRAVITY, parameter_limits, truth
-from pipeline.core.records import SENSORS, Motion
 from pipeline.physics.signal.rests import still_samples
 from pipeline.simulation.trajectory import CommandedTurns, mounted, rotation_about, rotation_by
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from pipeline.physics.effects.base import Effect
     from pipeline.core.records import Values
     from pipeline.core.settings import DataSheet, Sensor
+    from pipeline.physics.effects.base import Effect
     from pipeline.simulation.trajectory import Gimbals, RestsAndMoves
 
     Alteration = Callable[["Scene", Values], "Scene"]

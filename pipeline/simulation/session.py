@@ -26,9 +26,9 @@ import scipy
 import yaml
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.physics.kinematics import earth_of
 from pipeline.core.records import AXES, SENSORS, Recording, continuous
 from pipeline.core.settings import ProgramRest, Repeated
+from pipeline.physics.kinematics import earth_of
 from pipeline.simulation import procedures
 from pipeline.simulation.description import BY_FILE, BY_PROGRAM, course_of, read_option
 from pipeline.simulation.procedures import ONE_RECORDING
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.ingest.commanded_motion import Program
     from pipeline.core.records import Values
     from pipeline.core.settings import ProgramTurn, Table
+    from pipeline.ingest.commanded_motion import Program
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.procedures import Course
     from pipeline.simulation.sensor import Hidden, SimulatedSensor

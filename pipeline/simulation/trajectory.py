@@ -40,14 +40,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 import scipy
 
-from pipeline.physics.kinematics import attitude_matrix, level_at_zero, turn_by_vector
 from pipeline.core.settings import ProgramRest, ProgramTurn
+from pipeline.physics.kinematics import attitude_matrix, level_at_zero, turn_by_vector
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.ingest.commanded_motion import Program
     from pipeline.core.records import Index, Values
+    from pipeline.ingest.commanded_motion import Program
 
 
 ProgramStep: TypeAlias = ProgramRest | ProgramTurn

@@ -11,11 +11,11 @@ import pytest
 from unit_settings import ingest_of
 
 from pipeline.app.commands.apply import main
-from pipeline.core.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
 from pipeline.app.field_logs.compensate import compensate_log
 from pipeline.app.field_logs.stream import LogProfile
-from pipeline.physics.compensation import load
+from pipeline.core.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
 from pipeline.core.records import FittedEffect, SensorCalibration
+from pipeline.physics.compensation import load
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -18,12 +18,12 @@ from unit_settings import ingest_of
 
 from imu_logs.mcap_write import DEFINITIONS, IMU, TEMPERATURE
 from pipeline.app.commands.apply import main
-from pipeline.core.errors import InputError
-from pipeline.estimation.noise_identification import identify_noise
 from pipeline.app.field_logs.compensate import compensate_log
 from pipeline.app.field_logs.stream import LogProfile
-from pipeline.physics.compensation import load
+from pipeline.core.errors import InputError
 from pipeline.core.records import SENSORS, FittedEffect, Recording, SensorCalibration
+from pipeline.estimation.noise_identification import identify_noise
+from pipeline.physics.compensation import load
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

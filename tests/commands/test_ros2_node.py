@@ -13,12 +13,12 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.app.commands.apply import main as apply_main
-from pipeline.estimation.noise_identification import identify_noise
 from pipeline.app.field_logs import ros2_node
 from pipeline.app.field_logs.ros2_node import MessageCalibrator
 from pipeline.core.files import write_json
-from pipeline.ingest.write import write_recording
 from pipeline.core.records import FittedEffect, Recording, SensorCalibration
+from pipeline.estimation.noise_identification import identify_noise
+from pipeline.ingest.write import write_recording
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,8 +15,8 @@ from pipeline.__main__ import main
 from pipeline.app.config import Campaign, load_campaign
 from pipeline.app.config.options import parse
 from pipeline.app.config.stage_settings import in_common, settings_in_memory
-from pipeline.core.errors import ConfigurationError
 from pipeline.app.steps.batch import merge_common
+from pipeline.core.errors import ConfigurationError
 
 HYDRA = OverridesParser.create()
 SHEET = """unit,serial,lot,sensor,filter,overrides

@@ -13,9 +13,9 @@ from pipeline.app.config.campaign import load_campaign
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.options import Problem
 from pipeline.app.config.stage_settings import settings_of_jobs
+from pipeline.app.steps.batch import merge_common
 from pipeline.core.errors import ConfigurationError
 from pipeline.ingest.read import read_recordings
-from pipeline.app.steps.batch import merge_common
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,8 +13,8 @@ from pipeline.app.commands import add, explain, simulate, unpack
 from pipeline.app.commands import run as run_command
 from pipeline.app.config import load_campaign, owner
 from pipeline.app.config.owner import OtherCampaignError, check_owner, claim
-from pipeline.core.errors import ConfigurationError
 from pipeline.app.results_folder import read_owner, release_locks
+from pipeline.core.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -8,9 +8,9 @@ import pytest
 from whole_run import settings_names
 
 from pipeline.app.config import load_campaign, stage_settings
-from pipeline.physics.effects import built_in
-from pipeline.output.pages import unit_page
 from pipeline.app.steps import MODULES
+from pipeline.output.pages import unit_page
+from pipeline.physics.effects import built_in
 
 SHEET = """unit,method,overrides
 A1,,

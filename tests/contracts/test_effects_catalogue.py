@@ -11,12 +11,12 @@ import pytest
 import yaml
 from bench_session import CONTINUOUS, SIZE, K, Session, random_motion, record, values_of
 
+from pipeline.core.records import SENSORS, Answer, Motion
 from pipeline.evaluation.diagnosis.words import to_distinguish
 from pipeline.physics import effects
 from pipeline.physics.effects import built_in, built_in_files, catalogue
 from pipeline.physics.effects.base import Effect, Owner, parameter_limits
 from pipeline.physics.kinematics import reference_motion
-from pipeline.core.records import SENSORS, Answer, Motion
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "effect"
 BOTH = [

@@ -15,12 +15,14 @@ import pipeline
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-ROOT = Path(pipeline.__file__).parent
+ROOT = Path(pipeline.__file__).parents[1]
+PACKAGES = ("pipeline", "imu_logs", "imu_research")
 
 
 @cache
 def modules() -> dict[str, Path]:
-    found = {file: file.relative_to(ROOT.parent).with_suffix("").parts for file in ROOT.rglob("*.py")}
+    files = [file for package in PACKAGES for file in (ROOT / package).rglob("*.py")]
+    found = {file: file.relative_to(ROOT).with_suffix("").parts for file in files}
     return {".".join(parts[:-1] if parts[-1] == "__init__" else parts): file for file, parts in found.items()}
 
 

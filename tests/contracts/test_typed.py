@@ -12,19 +12,23 @@ from pipeline.core.settings import Section
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-ROOT = Path(pipeline.core.settings.__file__).parent
+ROOT = Path(pipeline.core.settings.__file__).parents[1]
 JSON = ("Mapping[str, Any]", "dict[str, Any]", "JSON")
-SECTIONS = {n for n, kind in vars(pipeline.core.settings).items() if isinstance(kind, type) and issubclass(kind, Section)}
+SECTIONS = {
+    n for n, kind in vars(pipeline.core.settings).items() if isinstance(kind, type) and issubclass(kind, Section)
+}
 # Modules and packages with functions that take JSON, by the reason.
 TAKE_JSON = {
     "the configuration, effects, profiles and simulations as files state them, before they are checked": (
-        "commands/config.py", "config/", "model/effects/", "model/sensor_file.py", "settings.py", "simulation/",
+        "app/commands/config.py", "app/config/", "physics/effects/", "physics/sensor_file.py",
+        "core/settings.py", "simulation/",
     ),
     "documents of a run: written, read, and shown on pages, by commands and in formats of other programs": (
-        "commands/explain.py", "commands/noise.py", "diagnosis/words.py", "exports/", "field_logs/stream.py",
-        "history.py", "io/arrow.py", "io/axis_maps.py", "io/digests.py", "model/calibration_file.py",
-        "model/compensation.py", "model/open_effects.py", "outcome.py", "planning/plan.py", "records/", "report/",
-        "result.py", "results_folder.py", "stages/", "study/result.py", "thesis/page.py", "verdicts.py",
+        "app/commands/explain.py", "app/commands/noise.py", "evaluation/diagnosis/words.py", "output/exports/",
+        "app/field_logs/stream.py", "output/history.py", "ingest/arrow.py", "ingest/axis_maps.py",
+        "ingest/digests.py", "physics/calibration_file.py", "physics/compensation.py",
+        "physics/open_effects.py", "output/outcome.py", "app/planning/plan.py", "core/records/",
+        "output/pages/", "app/result.py", "app/results_folder.py", "app/steps/", "core/verdicts.py",
     ),
 }  # fmt: skip
 

@@ -17,8 +17,8 @@ from jsonschema import Draft202012Validator
 import pipeline
 from pipeline.app.commands import add, apply, convert, explain
 from pipeline.app.config.campaign import load_campaign
-from pipeline.output.exports.reading import read_any
 from pipeline.core.records import READABLE_VERSIONS, SCHEMA_VERSION, SENSORS
+from pipeline.output.exports.reading import read_any
 
 HERE, ROOT, UNIT = Path(__file__).parent, Path(__file__).parents[2], "mpu6050-2-hidden"
 DEVICE = 'overrides:\n  - "effects.gyroscope=[g_sensitivity]"\n'

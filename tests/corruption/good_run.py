@@ -17,11 +17,11 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.core.errors import PipelineError
-from pipeline.core.records import SENSORS
 from imu_research.study.cases import FAMILIES, draw
 from imu_research.study.run import diagnose_case
 from imu_research.study.scores import wilson
+from pipeline.core.errors import PipelineError
+from pipeline.core.records import SENSORS
 
 if TYPE_CHECKING:
     from pipeline.unit import UnitState

@@ -24,16 +24,16 @@ from bench_session import (
 )
 from unit_settings import settings_of, with_noise
 
-from pipeline.evaluation.diagnosis.observability import not_observable
-from pipeline.evaluation.diagnosis.words import in_words
+from pipeline.core.records import Noise, Recording, SensorCalibration
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
+from pipeline.evaluation.diagnosis.observability import not_observable
+from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.physics.effects import effect_from, forget, register
 from pipeline.physics.kinematics import table_motion
-from pipeline.core.records import Noise, Recording, SensorCalibration
 from pipeline.physics.signal.filters import apply_filter
 from pipeline.simulation.description import shipped_settings
 from tests.published import diagnose

@@ -14,9 +14,9 @@ from hand_session import WARM, Unit, hand_held
 from hand_simulator import Hand, draw
 from unit_settings import settings_of, with_noise
 
-from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.noise import estimate_noise
+from pipeline.evaluation.diagnosis.words import in_words
 from tests.published import diagnose, validate
 
 NAMED = [

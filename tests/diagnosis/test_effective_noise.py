@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from unit_settings import settings_of
 
-from pipeline.evaluation.diagnosis.effective_noise import effective_noise
 from pipeline.core.records import Estimate, Noise, Recording, SensorCalibration, SensorDiagnosis
 from pipeline.core.verdicts import Verdict
+from pipeline.evaluation.diagnosis.effective_noise import effective_noise
 from tests.published import candidate
 
 DT, N = 0.01, 60_000

@@ -13,6 +13,14 @@ import yaml
 from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Course, Session, record, values_of
 from unit_settings import settings_of
 
+from pipeline.app.steps.diagnose import effect_file
+from pipeline.core.records import Dependence, FittedForm, RankedFormula, Recording, SensorCalibration
+from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.gauss_markov import Setting
+from pipeline.estimation.generalized_least_squares import fit_joint, fit_terms
+from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.observations import observe
+from pipeline.estimation.selection import Selection, select
 from pipeline.evaluation.diagnosis import turntable
 from pipeline.evaluation.diagnosis.formula_discovery import (
     Discovery,
@@ -24,18 +32,10 @@ from pipeline.evaluation.diagnosis.functional_forms import Factor, Form, Span, c
 from pipeline.evaluation.diagnosis.residual_dependence import dependences
 from pipeline.evaluation.diagnosis.residual_regression import ProjectedCurves, Scan
 from pipeline.evaluation.diagnosis.words import in_words
-from pipeline.estimation.design import EffectColumns
-from pipeline.estimation.gauss_markov import Setting
-from pipeline.estimation.generalized_least_squares import fit_joint, fit_terms
-from pipeline.estimation.noise import estimate_noise
-from pipeline.estimation.observations import observe
-from pipeline.estimation.selection import Selection, select
 from pipeline.physics.effects import effect_from, forget, register
 from pipeline.physics.kinematics import reference_motion
-from pipeline.core.records import Dependence, FittedForm, RankedFormula, Recording, SensorCalibration
 from pipeline.physics.signal.filters import smooth_temperature
 from pipeline.simulation.description import shipped_settings
-from pipeline.app.steps.diagnose import effect_file
 from tests.published import diagnose
 
 SHEET = shipped_settings(sensor="mpu6050").sensor

@@ -8,15 +8,15 @@ from hand_simulator import Hand, draw
 from scipy.spatial.transform import Rotation
 from unit_settings import settings_of, with_noise
 
+from pipeline.core.errors import CannotCalibrateError
+from pipeline.core.records import Recording, SensorCalibration, SensorDiagnosis, StageResult
+from pipeline.core.verdicts import Verdict
+from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
+from pipeline.estimation.stages import fit_stage
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput
 from pipeline.evaluation.diagnosis.method_errors import given_differences
 from pipeline.evaluation.diagnosis.multi_position import _model_of_all_rests
 from pipeline.evaluation.diagnosis.verdict import HeldOutError, VerdictInput, decide, judged
-from pipeline.core.errors import CannotCalibrateError
-from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
-from pipeline.estimation.stages import fit_stage
-from pipeline.core.records import Recording, SensorCalibration, SensorDiagnosis, StageResult
-from pipeline.core.verdicts import Verdict
 
 ABOVE = HeldOutError(0.5, 0.01, 0.1)
 GIVEN = VerdictInput("gyroscope", "nothing_missing", over_noise=0.9, published=ABOVE, method="given", on_table=False)

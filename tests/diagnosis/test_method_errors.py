@@ -11,12 +11,12 @@ import pytest
 from bench_session import BIAS, CONTINUOUS, STOP_AND_GO, Course, K, Session, record, values_of
 from unit_settings import filter_of, settings_of, with_noise
 
-from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import fit_stage
+from pipeline.evaluation.diagnosis.words import in_words
+from pipeline.evaluation.held_out.heldout import validate
 from pipeline.physics.signal.filters import apply_filter
 from pipeline.simulation.description import shipped_settings
-from pipeline.evaluation.held_out.heldout import validate
 from tests.published import diagnose
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.app.one_unit import unit_of_recordings
 from pipeline.core.records import SENSORS, Estimate, Recording, SensorCalibration, SensorDiagnosis
+from pipeline.core.verdicts import Verdict
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
-from pipeline.core.verdicts import Verdict
 from tests.published import candidate, diagnose
 
 COURSE: dict[str, Any] = {

@@ -13,14 +13,14 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "study"))
 from bench_units import drawn, judged
 from unit_settings import with_noise
 
-from pipeline.evaluation.diagnosis.diagnose import _doubts_of_gravity
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput
-from pipeline.estimation.effects import mountings_by_gravity
 from pipeline.app.one_unit import unit_row
 from pipeline.checks.checks import check_recordings
 from pipeline.core.records import SensorCalibration, SensorDiagnosis
-from pipeline.simulation.campaign import simulate_unit
 from pipeline.core.verdicts import Verdict
+from pipeline.estimation.effects import mountings_by_gravity
+from pipeline.evaluation.diagnosis.diagnose import _doubts_of_gravity
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput
+from pipeline.simulation.campaign import simulate_unit
 
 
 def test_an_effect_of_the_accelerometer_is_not_taken_for_mountings() -> None:

@@ -12,10 +12,10 @@ import pytest
 from bench_session import STOP_AND_GO, Session, record, values_of
 from unit_settings import settings_of
 
-from pipeline.evaluation.diagnosis.residual_plots import Bins
+from pipeline.core.records import Recording, SensorCalibration
 from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.noise import estimate_noise
-from pipeline.core.records import Recording, SensorCalibration
+from pipeline.evaluation.diagnosis.residual_plots import Bins
 from pipeline.simulation.description import shipped_settings
 from tests.published import diagnose
 

@@ -8,16 +8,16 @@ from typing import Any
 import pytest
 from bench_session import Session, record
 
-from pipeline.evaluation.diagnosis.diagnose import doubts_of, held_out_of
-from pipeline.evaluation.diagnosis.verdict import HeldOutError, VerdictInput, decide, judged, verdict_of_selection
-from pipeline.estimation.stages import declared
-from pipeline.app.one_unit import unit_of_recordings
-from pipeline.output.outcome import commands_of
-from pipeline.core.records import Agreement, Dependence, Note, Recording, SelectionErrors, SensorDiagnosis, StepErrors
-from pipeline.output.pages.parameters import summary_row
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import draw
+from pipeline.app.one_unit import unit_of_recordings
+from pipeline.core.records import Agreement, Dependence, Note, Recording, SelectionErrors, SensorDiagnosis, StepErrors
 from pipeline.core.verdicts import Verdict
+from pipeline.estimation.stages import declared
+from pipeline.evaluation.diagnosis.diagnose import doubts_of, held_out_of
+from pipeline.evaluation.diagnosis.verdict import HeldOutError, VerdictInput, decide, judged, verdict_of_selection
+from pipeline.output.outcome import commands_of
+from pipeline.output.pages.parameters import summary_row
 from tests.published import TESTED, candidate
 
 INSIDE, ABOVE, BELOW = HeldOutError(1.0, 0.9, 1.2), HeldOutError(9.0, 0.9, 1.2), HeldOutError(0.5, 0.9, 1.2)

@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
+from pipeline.estimation.posterior import Answers
 from pipeline.evaluation.diagnosis.findings import next_experiment
 from pipeline.evaluation.diagnosis.words import PLUS_MINUS, in_words
-from pipeline.estimation.posterior import Answers
 from pipeline.physics.effects import catalogue
 from tests.published import candidate
 

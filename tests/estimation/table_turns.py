@@ -8,8 +8,8 @@ import numpy as np
 from scipy.signal import lfilter
 from unit_settings import settings_of, with_noise
 
-from pipeline.estimation.stages import fit_stage
 from pipeline.core.records import Recording, SensorCalibration
+from pipeline.estimation.stages import fit_stage
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -9,9 +9,9 @@ import pytest
 from ferraris_session import FITS
 from unit_settings import settings_of, with_noise
 
+from pipeline.core.records import BIAS, MATRIX, SensorCalibration, base_values
 from pipeline.estimation.reference_least_squares import fit as fit_on_table
 from pipeline.physics.effects import effect
-from pipeline.core.records import BIAS, MATRIX, SensorCalibration, base_values
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from unit_settings import settings_of
 
 from pipeline.core.errors import NotObservableError
-from pipeline.estimation.chips import chip_document
 from pipeline.core.records import Recording, SensorCalibration
+from pipeline.estimation.chips import chip_document
 
 Q = Rotation.from_euler("zyx", [90, 3, -2], degrees=True).as_matrix()
 PLACE = np.array([0.03, -0.02, 0.01])

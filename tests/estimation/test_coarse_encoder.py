@@ -4,9 +4,9 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from unit_settings import settings_of
 
+from pipeline.core.records import Noise, Recording
 from pipeline.estimation.observations import observe, weighted
 from pipeline.estimation.selection import select
-from pipeline.core.records import Noise, Recording
 
 WHITE = 0.03  # deg/s
 NOISE = Noise(np.full(3, WHITE), np.full(3, 1e-3), 100.0, "static")

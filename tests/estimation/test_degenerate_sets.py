@@ -11,9 +11,9 @@ from unit_settings import settings_of, with_noise
 
 from pipeline import calibrate
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
+from pipeline.core.records import Recording
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.core.records import Recording
 
 if TYPE_CHECKING:
     from pathlib import Path

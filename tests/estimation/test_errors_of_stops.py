@@ -10,12 +10,12 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from pipeline.estimation.design import Design
-from pipeline.estimation.gauss_markov import Setting
-from pipeline.estimation.observations import Observations, observe, weighted
 from pipeline.app.one_unit import unit_row
 from pipeline.checks.bench import signed_axis
 from pipeline.core.records import Noise
+from pipeline.estimation.design import Design
+from pipeline.estimation.gauss_markov import Setting
+from pipeline.estimation.observations import Observations, observe, weighted
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "preprocessing"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "study"))

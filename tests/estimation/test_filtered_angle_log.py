@@ -10,10 +10,10 @@ import pytest
 from bench_session import CONTINUOUS, STOP_AND_GO, WHITE, Session, record
 from unit_settings import filter_of, settings_of
 
-from pipeline.evaluation.diagnosis.residual_dependence import dependences
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
+from pipeline.evaluation.diagnosis.residual_dependence import dependences
 from pipeline.physics.signal.filters import apply_filter
 from pipeline.simulation.description import shipped_settings
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from unit_settings import settings_of
 
+from pipeline.core.records import FittedEffect, Recording, SensorCalibration
 from pipeline.estimation.frame import frame_uncertainty
 from pipeline.physics.calibration_file import OF_FRAME, beyond_uncertainty, frame_words
 from pipeline.physics.kinematics import turn_by_vector
-from pipeline.core.records import FittedEffect, Recording, SensorCalibration
 
 NORMAL = 1.959964
 

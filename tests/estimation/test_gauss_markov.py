@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
+from pipeline.core.records import Noise
 from pipeline.estimation.gauss_markov import (
     SLOW_SPECTRUM_SHARE,
     STATED_WIDTH,
@@ -19,7 +20,6 @@ from pipeline.estimation.gauss_markov import (
     orthonormal,
     variance_of_average,
 )
-from pipeline.core.records import Noise
 
 SETTINGS = [Setting(0.0, 1.0), Setting(0.1, 2.0), Setting(0.7, 60.0), Setting(5.0, 900.0), Setting(1.0, 0.3)]
 

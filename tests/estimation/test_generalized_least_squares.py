@@ -12,6 +12,7 @@ from scipy.special import stdtrit
 from unit_settings import settings_of, with_noise
 
 from pipeline.core.errors import ConfigurationError, NotObservableError
+from pipeline.core.records import SensorCalibration
 from pipeline.estimation.design import EffectColumns, ordinary_base
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gauss_markov import Products, Setting, selection_grid
@@ -21,7 +22,6 @@ from pipeline.estimation.observations import observe
 from pipeline.estimation.ranking import Ranking
 from pipeline.estimation.selection import select
 from pipeline.physics.effects import effect
-from pipeline.core.records import SensorCalibration
 from pipeline.physics.signal.filters import apply_filter
 from pipeline.simulation.description import shipped_settings
 

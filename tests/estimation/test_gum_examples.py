@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from pipeline.core.records import coverage_factor
 from pipeline.estimation.engine import derivative
 from pipeline.estimation.monte_carlo import compare, distribution_of, numerical_tolerance
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
-from pipeline.core.records import coverage_factor
 from tests.estimation.complex_step import solve_linear
 
 Function = Callable[[np.ndarray], np.ndarray]

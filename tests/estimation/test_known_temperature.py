@@ -15,9 +15,9 @@ import yaml
 import pipeline
 from pipeline.app.commands import simulate
 from pipeline.core.errors import ConfigurationError
-from pipeline.estimation import known_temperature
 from pipeline.core.files import read_json
 from pipeline.core.settings import DataSheet, KnownTemperature
+from pipeline.estimation import known_temperature
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.core.records import coverage_factor
 from pipeline.estimation.lot_prior import MIN_SIBLINGS, LotPrior, Prediction, lot_priors, with_prior
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
-from pipeline.core.records import coverage_factor
 
 KIND = np.array([0, 0, 0, 1, 1, 1])
 P = len(KIND)

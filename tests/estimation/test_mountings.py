@@ -12,13 +12,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from unit_settings import settings_of
 
+from pipeline.app.one_unit import unit_row
+from pipeline.checks.mounting import check_mounting
+from pipeline.core.records import FittedEffect, Noise, Recording, SensorCalibration, UnitRecordings
 from pipeline.estimation.effects import fit
 from pipeline.estimation.reference_least_squares import fit as fit_to_reference
 from pipeline.physics.effects import effect, effect_of
 from pipeline.physics.kinematics import reference_motion
-from pipeline.app.one_unit import unit_row
-from pipeline.checks.mounting import check_mounting
-from pipeline.core.records import FittedEffect, Noise, Recording, SensorCalibration, UnitRecordings
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "preprocessing"))
 from benches import BIAS, K, Setup, recordings_of

@@ -11,7 +11,9 @@ from scipy.signal import lfilter
 from scipy.stats import norm
 from unit_settings import filter_of, settings_of, with_noise
 
+from pipeline.app.one_unit import unit_row
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.records import Noise, Recording
 from pipeline.estimation.gauss_markov import (
     STATED_WIDTH,
     TIME_FACTORS,
@@ -22,8 +24,6 @@ from pipeline.estimation.gauss_markov import (
 from pipeline.estimation.noise import estimate_noise, wander_prior
 from pipeline.estimation.noise_terms import allan_deviation
 from pipeline.estimation.reference_least_squares import fit
-from pipeline.app.one_unit import unit_row
-from pipeline.core.records import Noise, Recording
 from pipeline.physics.signal.filters import apply_filter, filter_autocovariance
 
 SHEET = settings_of().sensor.accelerometer.replaced(noise_density=4e-4, bias_wander=1e-4, wander_time_s=100.0)

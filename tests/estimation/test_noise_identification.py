@@ -10,6 +10,7 @@ import pytest
 from scipy.fft import dct
 from scipy.signal import lfilter
 
+from pipeline.core.records import Recording
 from pipeline.estimation.noise_identification import identify_noise, static_stretches
 from pipeline.estimation.noise_terms import (
     INSTABILITY,
@@ -24,7 +25,6 @@ from pipeline.estimation.noise_terms import (
     maximised,
     spectrum_of,
 )
-from pipeline.core.records import Recording
 
 DT = 0.1
 Values = np.ndarray[Any, np.dtype[np.float64]]

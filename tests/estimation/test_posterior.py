@@ -11,6 +11,7 @@ import pytest
 from scipy.linalg import null_space
 from scipy.special import logsumexp
 
+from pipeline.core.records import Motion
 from pipeline.estimation.candidates import time_constants
 from pipeline.estimation.evidence import (
     LIMIT_SCALES,
@@ -24,7 +25,6 @@ from pipeline.estimation.evidence import (
 from pipeline.estimation.free_curves import BEND, free_curves
 from pipeline.estimation.posterior import ODDS, UPPER_LIMIT_SHARE, Answers, SetSearch, answers, quantiles
 from pipeline.estimation.ranking import without
-from pipeline.core.records import Motion
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

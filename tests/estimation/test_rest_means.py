@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from unit_settings import settings_of
 
-from pipeline.estimation.rest_means import held_out_rests, holdout_interval, rest_means, split_rests
 from pipeline.core.records import Recording
+from pipeline.estimation.rest_means import held_out_rests, holdout_interval, rest_means, split_rests
 from pipeline.physics.signal.rests import Rest
 
 PROCEDURE = settings_of(procedure={"holdout_every": 3}).procedure

@@ -8,9 +8,9 @@ from table_turns import Bench, run_stages, settings, specific_force, stepped_ang
 from unit_settings import filter_of, with_noise
 
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError, NotObservableError
-from pipeline.estimation.stages import fit_stage
 from pipeline.core.records import SensorCalibration, StageResult, coverage_factor
 from pipeline.core.records.correction import Subtract, TwoSided, corrected
+from pipeline.estimation.stages import fit_stage
 from pipeline.physics.signal.filters import apply_filter
 
 STAGES = ["orthogonality", "misalignment", "bias", "scale_factor"]

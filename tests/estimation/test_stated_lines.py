@@ -12,17 +12,17 @@ from stage_files import documents, write_pack
 from table_turns import Bench, settings
 from unit_settings import settings_of, with_noise
 
+from pipeline.app.steps import batch
+from pipeline.app.steps.filter import filter_recordings
+from pipeline.app.steps.unit_files import FILES
+from pipeline.checks.reference_scale import rate_error
+from pipeline.core.records import FittedEffect, Noise, Note, UnitRecordings
+from pipeline.core.settings import Settings
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.stated_lines import with_stated
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.ingest.arrow import to_parquet
 from pipeline.physics.calibration_file import beyond_uncertainty
-from pipeline.checks.reference_scale import rate_error
-from pipeline.core.records import FittedEffect, Noise, Note, UnitRecordings
-from pipeline.core.settings import Settings
-from pipeline.app.steps import batch
-from pipeline.app.steps.filter import filter_recordings
-from pipeline.app.steps.unit_files import FILES
 from pipeline.unit import STEPS
 
 if TYPE_CHECKING:

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from pipeline.physics.effects import bench_priors
-from pipeline.app.one_unit import unit_of_recordings
-from pipeline.core.records import SensorCalibration
-from pipeline.core.settings import OF_BENCH, Table
-from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import draw
 from imu_research.study.run import diagnose_case
+from pipeline.app.one_unit import unit_of_recordings
+from pipeline.core.records import SensorCalibration
+from pipeline.core.settings import OF_BENCH, Table
+from pipeline.physics.effects import bench_priors
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription
 
 if TYPE_CHECKING:
     from pipeline.core.records import Recording

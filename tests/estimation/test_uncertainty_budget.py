@@ -10,8 +10,8 @@ import pytest
 from table_turns import Bench, run_stages, settings, specific_force
 from unit_settings import settings_of
 
-from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from pipeline.core.records import coverage_factor
+from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 
 if TYPE_CHECKING:
     from collections.abc import Callable

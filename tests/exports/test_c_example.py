@@ -8,8 +8,8 @@ import pytest
 from test_c_header import document, needs_compiler
 
 from pipeline import load_calibration
-from pipeline.output.exports import ExportedUnit, export
 from pipeline.core.files import write_json
+from pipeline.output.exports import ExportedUnit, export
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "imu_loop.c"
 EFFECTS = {"accelerometer": {"bias_temperature": 1e-3}, "gyroscope": {"bias_temperature": 0.1, "g_sensitivity": 0.05}}

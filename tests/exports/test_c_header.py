@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from pipeline import load_calibration
+from pipeline.core.records import SENSORS, FittedEffect, SensorCalibration
 from pipeline.output.exports import ExportedUnit, export
 from pipeline.physics.compensation import SMOOTHING_S
 from pipeline.physics.effects import catalogue, effect, effect_from
 from pipeline.physics.effects.base import Owner
-from pipeline.core.records import SENSORS, FittedEffect, SensorCalibration
 
 BIAS = {"accelerometer": np.array([0.031, -0.022, 0.067]), "gyroscope": np.array([1.7, -0.9, 0.4])}
 MATRIX = {

@@ -14,9 +14,9 @@ from stage_files import export_all
 from unit_settings import settings_of
 
 from pipeline import load_calibration
+from pipeline.core.records import SENSORS, FittedEffect, SensorCalibration
 from pipeline.output.exports import Format, formats
 from pipeline.output.exports.reading import read_any
-from pipeline.core.records import SENSORS, FittedEffect, SensorCalibration
 
 G0, RADIAN = 9.80665, np.pi / 180.0
 BIAS = {"accelerometer": np.array([0.031, -0.022, 0.067]), "gyroscope": np.array([1.7, -0.9, 0.4])}

@@ -12,15 +12,15 @@ import pytest
 import yaml
 from stage_files import export_all
 
-from pipeline import exports
 from pipeline.app.commands.convert import main as convert
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.records import FittedEffect, SensorCalibration
+from pipeline.core.settings import Settings
+from pipeline.output import exports
 from pipeline.output.exports import formats
 from pipeline.output.exports.reading import read_any
 from pipeline.output.exports.sensors import lower_times_rotation
 from pipeline.physics.effects import effect
-from pipeline.core.records import FittedEffect, SensorCalibration
-from pipeline.core.settings import Settings
 from pipeline.simulation.description import shipped_settings
 
 FILES = {

@@ -11,8 +11,8 @@ from stage_files import export_all
 from unit_settings import settings_of
 
 from pipeline import load_calibration
-from pipeline.output.exports.sensors import ExportedSensor
 from pipeline.core.records import FittedEffect, SensorCalibration
+from pipeline.output.exports.sensors import ExportedSensor
 
 G0 = 9.80665
 BIAS = {"accelerometer": np.array([0.031, -0.022, 0.067]), "gyroscope": np.array([1.7, -0.9, 0.4])}

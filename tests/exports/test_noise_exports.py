@@ -13,13 +13,13 @@ from scipy.signal import lfilter
 from stage_files import export_all
 from unit_settings import settings_of
 
+from pipeline.core.records import SENSORS, Recording, SensorCalibration
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_terms import allan_variance
 from pipeline.output.exports import ExportedUnit, export
 from pipeline.output.exports.conversion import document_of, with_noise
 from pipeline.output.exports.reading import read_any
 from pipeline.output.exports.sensors import INSTABILITY_FLOOR, SensorFigures, noise
-from pipeline.core.records import SENSORS, Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,15 +11,16 @@ import yaml
 from stage_files import export_all
 from test_consumer_formats import BIAS, COUNTS, MATRIX, SCALED, SENSITIVE, SETTINGS, WARM, WARMER
 
-from pipeline import exports, load_calibration
+from pipeline import load_calibration
 from pipeline.app.commands.convert import main
+from pipeline.app.field_logs.stream import LogProfile
 from pipeline.core.errors import ConfigurationError, InputError
+from pipeline.core.records import SENSORS, SensorCalibration
+from pipeline.output import exports
 from pipeline.output.exports import formats
 from pipeline.output.exports.conversion import SAMPLE, explain_calibration
 from pipeline.output.exports.reading import read_any
-from pipeline.app.field_logs.stream import LogProfile
 from pipeline.physics.calibration_file import read_calibration
-from pipeline.core.records import SENSORS, SensorCalibration
 
 G0, RADIAN = 9.80665, np.pi / 180.0
 EFFECTS = {"accelerometer": (WARMER, SCALED), "gyroscope": (SENSITIVE, WARM)}

@@ -16,12 +16,12 @@ from unit_settings import ingest_of, settings_of
 from imu_logs import text_lines as text_log
 from imu_logs.text_layout import TextLayout
 from pipeline.app.config.compose import check_ingest
+from pipeline.app.steps.gather import same_files
+from pipeline.checks.checks import check_recordings
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.ingest.read import read_recordings
-from pipeline.physics.calibration_file import left_out
-from pipeline.checks.checks import check_recordings
 from pipeline.output.pages.campaign_page import render
-from pipeline.app.steps.gather import same_files
+from pipeline.physics.calibration_file import left_out
 
 if TYPE_CHECKING:
     from pipeline.core.records import Recording

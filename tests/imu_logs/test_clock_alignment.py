@@ -14,11 +14,11 @@ from unit_settings import ingest_of, settings_of
 from imu_logs.mcap_write import IMU, JOINT_STATE
 from imu_logs.profile import Checks
 from pipeline.core.errors import IngestError, InputError
+from pipeline.core.records import rate_of_attitude
+from pipeline.core.settings import RecordingFile
 from pipeline.ingest.clock_alignment import align
 from pipeline.ingest.read import read_recordings, to_recording
 from pipeline.physics.kinematics import reference_motion
-from pipeline.core.records import rate_of_attitude
-from pipeline.core.settings import RecordingFile
 
 if TYPE_CHECKING:
     from pathlib import Path

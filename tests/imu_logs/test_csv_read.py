@@ -17,9 +17,9 @@ from unit_settings import ingest_of, sheet_of
 from imu_logs.profile import csv_formats
 from imu_logs.text_read import read_csv
 from pipeline.core.errors import IngestError
+from pipeline.core.records import Recording
 from pipeline.ingest.read import read_recordings
 from pipeline.ingest.write import write_recording
-from pipeline.core.records import Recording
 
 if TYPE_CHECKING:
     from pathlib import Path

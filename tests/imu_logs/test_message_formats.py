@@ -36,8 +36,8 @@ from pipeline.app.commands.check import main as check
 from pipeline.app.config.compose import check_ingest
 from pipeline.core.errors import ConfigurationError, IngestError, InputError
 from pipeline.core.files import CONFIGS
-from pipeline.ingest.read import read_recordings
 from pipeline.core.records import SensorCalibration
+from pipeline.ingest.read import read_recordings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,8 +10,8 @@ import pytest
 from simulated_logs import as_table
 
 from pipeline.core.errors import IngestError
-from pipeline.ingest.commanded_motion import Program, follow_program
 from pipeline.core.records import Recording
+from pipeline.ingest.commanded_motion import Program, follow_program
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.session import Streams, as_program
 from pipeline.simulation.trajectory import CommandedTurns, rest, turn

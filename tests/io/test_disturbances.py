@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.ingest.disturbances import disturbed, leave_out_disturbances
 from pipeline.core.records import Note, Recording
+from pipeline.ingest.disturbances import disturbed, leave_out_disturbances
 
 INTERVAL = 0.05
 NOISE = {"accelerometer": 1e-3, "gyroscope": 0.02}

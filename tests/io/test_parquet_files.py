@@ -18,8 +18,8 @@ from stage_files import load_recordings, save_recordings
 from unit_settings import ingest_of
 
 from pipeline.core.errors import InputError
-from pipeline.ingest.read import read_recordings
 from pipeline.core.records import Note, Recording
+from pipeline.ingest.read import read_recordings
 
 if TYPE_CHECKING:
     from pathlib import Path

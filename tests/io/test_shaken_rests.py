@@ -9,9 +9,9 @@ import pytest
 from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Session, record, values_of
 from unit_settings import settings_of, with_noise
 
+from pipeline.core.records import Note, Recording
 from pipeline.estimation.stages import fit_stage
 from pipeline.ingest.disturbances import leave_out_disturbances, leave_out_shaken_rests
-from pipeline.core.records import Note, Recording
 
 SETTINGS = settings_of(sensor={"accelerometer": {"bias_wander": 1e-4, "cross_axis": 0.02}})
 METHODS = {"reference": "reference_least_squares", "magnitude": "nonlinear_least_squares"}

@@ -5,9 +5,9 @@ from itertools import product
 import numpy as np
 import pytest
 
+from pipeline.core.records import Motion, Recording
 from pipeline.ingest.commanded_motion import Program
 from pipeline.physics.kinematics import reference_motion
-from pipeline.core.records import Motion, Recording
 from pipeline.simulation.trajectory import rest, turn, turn_with_plateau
 
 INTERVAL = 0.12

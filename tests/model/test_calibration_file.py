@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from pipeline.app.steps.calibration import calibrated_range, judged
+from pipeline.core.records import FittedEffect, Recording, SensorCalibration
 from pipeline.ingest.quality_flags import CLIPPED
 from pipeline.physics.calibration_file import implausible, sample_covariance, sentences
-from pipeline.core.records import FittedEffect, Recording, SensorCalibration
 from pipeline.simulation.description import shipped_settings
-from pipeline.app.steps.calibration import calibrated_range, judged
 
 if TYPE_CHECKING:
     from pipeline.core.settings import DataSheet

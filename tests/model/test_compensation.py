@@ -10,12 +10,12 @@ import pytest
 
 import pipeline
 from pipeline.core.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError, PipelineError
+from pipeline.core.records import SENSORS, FittedEffect, Motion, SensorCalibration
 from pipeline.physics.compensation import BLOCK, Compensation, load
 from pipeline.physics.effects import catalogue, effect_from
 from pipeline.physics.effects.base import Owner
 from pipeline.physics.log_motion import ExponentialRegression
 from pipeline.physics.measurement import compensate, predicted_reading
-from pipeline.core.records import SENSORS, FittedEffect, Motion, SensorCalibration
 
 SIZE = {"accelerometer": 2e-3, "gyroscope": 1e-5}
 EFFECTS = [(s, e.name) for s in SENSORS for e in catalogue().values() if e.owner == Owner.SENSOR and s in e.sensors]

@@ -10,11 +10,11 @@ from bench_session import K, Session, record
 from scipy.spatial.transform import Rotation
 
 from pipeline.core.errors import ConfigurationError, InputError
+from pipeline.core.records import FittedEffect, Motion, Recording, SensorCalibration
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import parameter_limits, turning_direction
 from pipeline.physics.kinematics import reference_motion
 from pipeline.physics.measurement import predicted_reading
-from pipeline.core.records import FittedEffect, Motion, Recording, SensorCalibration
 
 ONE = np.eye(3)
 

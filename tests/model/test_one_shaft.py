@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.physics.kinematics import EARTH_RATE_DPS, earth_rate, reference_motion
 from pipeline.core.records import Recording
+from pipeline.physics.kinematics import EARTH_RATE_DPS, earth_rate, reference_motion
 
 LATITUDE, AZIMUTH = 48.0, 80.0
 UP = {"x": "z", "y": "z", "z": "x"}  # the body axis that points up at angle 0 (docs/mounting.md)

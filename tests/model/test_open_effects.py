@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.physics.open_effects import both_figures, open_words, with_open
 from pipeline.core.records import Budget, NotIncluded, SensorCalibration
+from pipeline.physics.open_effects import both_figures, open_words, with_open
 
 U_BIAS = 1e-3 * 1.959964
 CALIBRATION = SensorCalibration(

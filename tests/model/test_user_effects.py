@@ -17,6 +17,8 @@ from unit_settings import settings_of
 
 from pipeline import load_calibration
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.core.records import FittedEffect, Motion, Recording, SensorCalibration
+from pipeline.core.settings import UserEffectFiles
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.physics.effects import (
     built_in,
@@ -33,8 +35,6 @@ from pipeline.physics.effects import (
 from pipeline.physics.effects.base import Layout, parameter_limits
 from pipeline.physics.formula import FUNCTIONS, SIGNALS
 from pipeline.physics.kinematics import reference_motion
-from pipeline.core.records import FittedEffect, Motion, Recording, SensorCalibration
-from pipeline.core.settings import UserEffectFiles
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

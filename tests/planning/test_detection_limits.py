@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.app.planning.detection_limits import noise_sums
+from pipeline.app.planning.plan import FAULTLESS, ROOM, plan_of, stated_noise
+from pipeline.core.records import SENSORS
 from pipeline.estimation.design import EffectColumns, ordinary_base
 from pipeline.estimation.gates import passes
 from pipeline.estimation.gauss_markov import Blocks, Setting, selection_grid
@@ -15,9 +18,6 @@ from pipeline.estimation.observations import observe
 from pipeline.estimation.ranking import Ranking
 from pipeline.estimation.selection import select
 from pipeline.physics.effects import catalogue, effect
-from pipeline.app.planning.detection_limits import noise_sums
-from pipeline.app.planning.plan import FAULTLESS, ROOM, plan_of, stated_noise
-from pipeline.core.records import SENSORS
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
 

@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from unit_settings import with_noise
 
-from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.app.planning.guide import (
     TURNS_DEG,
     GuideProgress,
@@ -27,6 +26,7 @@ from pipeline.app.planning.guide import (
     progress_of as progress_of_unit,
 )
 from pipeline.core.records import Recording, SensorCalibration
+from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:

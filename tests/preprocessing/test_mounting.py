@@ -13,12 +13,12 @@ from benches import BIAS, INTERVAL_S, RATE, Setup, entry_of, recordings_of, sett
 from benches import K as TRUE_K
 from scipy.spatial.transform import Rotation
 
-from pipeline.core.errors import IngestError
-from pipeline.estimation.reference_least_squares import fit
-from pipeline.physics.kinematics import reference_motion
 from pipeline.checks.checks import check_recordings
 from pipeline.checks.mounting import check_mounting, words
+from pipeline.core.errors import IngestError
 from pipeline.core.records import Recording
+from pipeline.estimation.reference_least_squares import fit
+from pipeline.physics.kinematics import reference_motion
 
 LEVEL = [
     (a, s + u) for a in "xyz" for u in "xyz" for s in "+-" if u != a

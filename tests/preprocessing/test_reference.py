@@ -14,17 +14,17 @@ from bad_units import SETTINGS, cases, sound
 from scipy.spatial.transform import Rotation
 from unit_settings import settings_of
 
-from pipeline.evaluation.diagnosis.diagnose import doubts_of
-from pipeline.core.errors import IngestError
+from imu_research.study.bench import recordings_of
+from imu_research.study.cases import FAMILIES, draw
 from pipeline.app.one_unit import unit_row
 from pipeline.checks.at_rest import check_axes, check_static
 from pipeline.checks.checks import check_recordings
 from pipeline.checks.reference import _interval, check_motion
+from pipeline.core.errors import IngestError
 from pipeline.core.records import Recording
+from pipeline.evaluation.diagnosis.diagnose import doubts_of
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import read_description
-from imu_research.study.bench import recordings_of
-from imu_research.study.cases import FAMILIES, draw
 
 if TYPE_CHECKING:
     from pipeline.core.records import Note

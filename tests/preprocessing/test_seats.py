@@ -10,10 +10,10 @@ import pytest
 from benches import Setup, recordings_of, settings_of
 from scipy.spatial.transform import Rotation
 
-from pipeline.checks.bench import fit_turn, signed_axis
-from pipeline.checks.mounting import check_mounting
 from imu_research.study.bench import recordings_of as recordings_of_case
 from imu_research.study.cases import FAMILIES, draw
+from pipeline.checks.bench import fit_turn, signed_axis
+from pipeline.checks.mounting import check_mounting
 
 if TYPE_CHECKING:
     from pipeline.core.records import Recording

@@ -16,8 +16,8 @@ from imu_logs.profile import Checks, csv_formats
 from imu_logs.proposal import Proposal, as_yaml
 from imu_logs.text_read import read_csv
 from pipeline.app.config.compose import Composer
-from pipeline.core.errors import IngestError
 from pipeline.app.profile_detection.unit_guesses import propose
+from pipeline.core.errors import IngestError
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "data"
 

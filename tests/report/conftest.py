@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from unit_settings import settings_of
 
-from pipeline.physics.kinematics import reference_motion
 from pipeline.core.records import Estimate, Note, Recording, SensorCalibration, StageResult
 from pipeline.core.settings import Settings, Stated
+from pipeline.physics.kinematics import reference_motion
 
 SIGMA = {"accelerometer": 0.003, "gyroscope": 0.05}
 EFFECT = 0.004  # quadratic nonlinearity of the accelerometer, g/g^2, which the calibration does not know

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from pipeline.core.records import SensorCalibration
 from pipeline.estimation.least_squares import convergence_evidence
 from pipeline.estimation.table_errors import type_b
 from pipeline.estimation.uncertainty_budget import combined, scatter_contribution
-from pipeline.core.records import SensorCalibration
 from pipeline.output.pages.pages import template
 from pipeline.output.pages.unit_page import render
 

@@ -16,9 +16,9 @@ import pytest
 
 import pipeline
 from pipeline.core.errors import InputError, MissingInputError
+from pipeline.core.records import Recording
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.output.outcome import read_summary
-from pipeline.core.records import Recording
 from pipeline.output.pages.fleet import write_summary
 from pipeline.output.pages.parameters import summary_row
 

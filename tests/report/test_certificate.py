@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
+from pipeline.core.settings import Certificate, Settings, Stated
 from pipeline.output.pages.certificate import STAMP, certificate
 from pipeline.output.pages.certificate import certificate_page as render
-from pipeline.core.settings import Certificate, Settings, Stated
 
 from .conftest import Unit, build_unit
 

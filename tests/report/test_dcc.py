@@ -10,8 +10,14 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from pipeline.output.pages.certificate import certificate, certificate_page, digital_certificate, dsi_unit, missing_for_dcc
 from pipeline.core.settings import Certificate
+from pipeline.output.pages.certificate import (
+    certificate,
+    certificate_page,
+    digital_certificate,
+    dsi_unit,
+    missing_for_dcc,
+)
 
 from .conftest import Unit, build_unit
 from .test_certificate import BUDGET, STATED, settings_of

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from unit_settings import sheet_of
 
-from pipeline.estimation.noise_identification import identify_noise
 from pipeline.core.records import Recording
+from pipeline.estimation.noise_identification import identify_noise
 from pipeline.output.pages.axis import scaled
 from pipeline.output.pages.diagnosis_section import _column_unit, added_variable, ranking, unexplained
 from pipeline.output.pages.held_out_section import error_steps

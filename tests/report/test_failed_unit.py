@@ -7,10 +7,10 @@ from hand_session import hand_held
 from stage_files import documents, write_pack
 
 from pipeline.app.config.compose import Composer
-from pipeline.ingest.arrow import to_parquet
+from pipeline.app.steps import batch
 from pipeline.core.pack import Pack
 from pipeline.core.settings import Stated
-from pipeline.app.steps import batch
+from pipeline.ingest.arrow import to_parquet
 from pipeline.unit import STEPS
 
 

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from pipeline.app.commands.explain import explain
+from pipeline.app.steps.calibration import judged
 from pipeline.core.files import write_json
+from pipeline.core.settings import Certificate, Stated
 from pipeline.output.outcome import outcome, read_summary
 from pipeline.output.pages import campaign_page
 from pipeline.output.pages.certificate import certificate, certificate_page
@@ -21,9 +23,7 @@ from pipeline.output.pages.chart import Figure, Panel, SampleMarks, chart
 from pipeline.output.pages.fleet import parameter_table, write_summary
 from pipeline.output.pages.parameters import SUMMARY_COLUMNS, summary_row, unit_parameters
 from pipeline.output.pages.unit_page import render
-from pipeline.core.settings import Certificate, Stated
 from pipeline.simulation.description import shipped_settings
-from pipeline.app.steps.calibration import judged
 
 from .conftest import SHEET, Unit, build_unit
 

@@ -5,10 +5,10 @@ import pytest
 from scipy.linalg import polar
 from unit_settings import sheet_of
 
-from pipeline.physics.calibration_file import beyond_limits, beyond_words
 from pipeline.core.records import FittedEffect, SensorCalibration
 from pipeline.output.pages.comparison import unit_figures
 from pipeline.output.pages.parameters import fitted_parameters, parameter_rows, reading_errors, sensor_errors
+from pipeline.physics.calibration_file import beyond_limits, beyond_words
 
 
 def part_with_unequal_freedom() -> dict:

@@ -7,20 +7,20 @@ from typing import Any
 
 import pytest
 
-from pipeline import diagnosis as diagnosis_package
-from pipeline import report as report_package
 from pipeline.app.commands.explain import explain
-from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.core.files import write_json
-from pipeline.output.outcome import counted
 from pipeline.core.records import SENSORS
+from pipeline.core.verdicts import error_in_row, error_of, kinds_of, problems
+from pipeline.evaluation import diagnosis as diagnosis_package
+from pipeline.evaluation.diagnosis.words import in_words
+from pipeline.output import pages as report_package
+from pipeline.output.outcome import counted
 from pipeline.output.pages import campaign_page
 from pipeline.output.pages.chart import Figure
 from pipeline.output.pages.diagnosis_section import limit_rows
 from pipeline.output.pages.group_charts import Point, bars
 from pipeline.output.pages.parameters import summary_row
 from pipeline.output.pages.unit_page import render
-from pipeline.core.verdicts import error_in_row, error_of, kinds_of, problems
 
 from .conftest import SHEET, Unit, build_unit
 from .test_pages import Text

@@ -9,10 +9,10 @@ import pytest
 from hand_simulator import Drawn, Hand, draw
 from unit_settings import with_noise
 
+from pipeline.core.records import Recording
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
-from pipeline.core.records import Recording
 from pipeline.physics.signal.quiet_motion import creep_of_readings, posterior_creep_rates
 from pipeline.physics.signal.rests import Rest, find_rests
 from tests.published import validate

@@ -12,10 +12,10 @@ import pytest
 from imu_logs.log import Log
 from imu_logs.profile import Checks
 from pipeline.core.errors import InputError
-from pipeline.ingest.encoder_log import unwrapped
-from pipeline.ingest.read import to_recording
 from pipeline.core.records import rate_of_attitude
 from pipeline.core.settings import RecordingFile, Window
+from pipeline.ingest.encoder_log import unwrapped
+from pipeline.ingest.read import to_recording
 from pipeline.physics.signal.segments import cut
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, course_of

@@ -12,13 +12,13 @@ import pytest
 
 from pipeline.app.commands.simulate import main
 from pipeline.app.config import load_campaign
-from pipeline.core.errors import ConfigurationError, IngestError, MissingInputError
-from pipeline.ingest.read import read_recordings
-from pipeline.physics.kinematics import reference_motion
 from pipeline.checks.at_rest import check_axes
 from pipeline.checks.evidence import ChannelLimits
 from pipeline.checks.reference_scale import doubt_of_angle
+from pipeline.core.errors import ConfigurationError, IngestError, MissingInputError
 from pipeline.core.records import SENSORS, Recording
+from pipeline.ingest.read import read_recordings
+from pipeline.physics.kinematics import reference_motion
 from pipeline.simulation.campaign import simulate_unit, write_campaign
 from pipeline.simulation.description import UnitDescription, description_from, read_description, shipped_settings
 

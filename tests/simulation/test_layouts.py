@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.ingest.commanded_motion import Program, _flat
 from pipeline.core.records import rate_of_attitude
+from pipeline.ingest.commanded_motion import Program, _flat
 from pipeline.simulation.campaign import simulate_unit, write_campaign
 from pipeline.simulation.description import UnitDescription, description_from
 from pipeline.simulation.procedures import Course, plan

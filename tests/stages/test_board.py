@@ -8,12 +8,12 @@ import numpy as np
 from board_simulator import by_hand, draw_chip, hand_board
 from stage_files import write_pack
 
-from pipeline.ingest.arrow import to_parquet
-from pipeline.core.pack import FAILED, Pack
-from pipeline.core.settings import Board
-from pipeline.simulation.description import shipped_settings
 from pipeline.app.steps.batch import Job
 from pipeline.app.steps.calibration import _on_board
+from pipeline.core.pack import FAILED, Pack
+from pipeline.core.settings import Board
+from pipeline.ingest.arrow import to_parquet
+from pipeline.simulation.description import shipped_settings
 from tests.published import TESTED, validation_document
 
 if TYPE_CHECKING:

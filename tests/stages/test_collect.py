@@ -5,9 +5,9 @@ import shutil
 from pathlib import Path
 
 from pipeline.app.config import load_campaign, settings_of_jobs
-from pipeline.core.pack import Pack
 from pipeline.app.results_folder import release_locks
 from pipeline.app.steps import batch
+from pipeline.core.pack import Pack
 
 DEMO = Path(__file__).parents[2] / "data" / "demo"
 SHEET = """unit,overrides

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.core.pack import Pack, new_pack
 from pipeline.app.results_folder import repetitions
-from pipeline.core.settings import Settings
 from pipeline.app.steps import batch, calibration
 from pipeline.app.steps import prior as prior_stage
+from pipeline.core.pack import Pack, new_pack
+from pipeline.core.settings import Settings
 
 if TYPE_CHECKING:
     from pathlib import Path

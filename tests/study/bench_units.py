@@ -25,16 +25,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from imu_research.study.scores import wilson
+from pipeline.app.one_unit import unit_of_recordings
 from pipeline.core.errors import PipelineError
+from pipeline.core.records import SENSORS, NotCalibrated, coverage_factor
 from pipeline.estimation.gauss_markov import TIME_FACTORS, TIME_PRIOR
 from pipeline.estimation.noise import wander_prior
 from pipeline.physics.effects import built_in
 from pipeline.physics.kinematics import reference_motion
-from pipeline.app.one_unit import unit_of_recordings
-from pipeline.core.records import SENSORS, NotCalibrated, coverage_factor
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
-from imu_research.study.scores import wilson
 
 TURNS = [f"{kind}_{axis}" for kind in ("accel", "gyro") for axis in "xyz"]
 COURSE: dict[str, Any] = {

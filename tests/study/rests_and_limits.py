@@ -15,8 +15,8 @@ import numpy as np
 from unit_settings import settings_of, with_noise
 
 from pipeline.core.errors import NotObservableError
-from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
 from pipeline.core.records import Recording
+from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
 
 LOWER = [0, 1, 2, 3, 6, 7, 9, 10, 11]  # of bias and matrix
 KINDS = {"bias": [0, 1, 2], "scale factor": [3, 5, 8], "misalignment": [4, 6, 7]}  # of these nine

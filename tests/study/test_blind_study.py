@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from imu_research.commands import study as main
-from pipeline.core.errors import ConfigurationError
-from pipeline.estimation.gates import MIN_DELTA_BIC
-from pipeline.physics.effects import catalogue
-from pipeline.core.records import SENSORS
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import FAMILIES, SIZES, StudyCase, draw
 from imu_research.study.result import ScoredCase
 from imu_research.study.run import diagnose_case, judge, read_lines, scored
 from imu_research.study.scores import exact, first_is_right, in_the_set, not_seen, outside_answered
+from pipeline.core.errors import ConfigurationError
+from pipeline.core.records import SENSORS
+from pipeline.estimation.gates import MIN_DELTA_BIC
+from pipeline.physics.effects import catalogue
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,19 +9,19 @@ import pandas as pd
 import pytest
 from unit_settings import settings_of, with_noise
 
-from pipeline.app.config import load_campaign
-from pipeline.estimation.accelerometer.staged import STAGE_EQUATIONS as OF_ACCELEROMETER
-from pipeline.estimation.gyroscope.staged import STAGE_EQUATIONS as OF_GYROSCOPE
-from pipeline.estimation.stages import fit_stage
-from pipeline.physics.measurement import linear_truth
-from pipeline.core.records import Recording, SensorCalibration, coverage_factor
-from pipeline.physics.signal.filters import apply_filter
-from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import read_description
 from imu_research.thesis.findings import TRUE_SCALE
 from imu_research.thesis.seeds import FOUND, study_of
 from imu_research.thesis.tables import DEVICES, SILENT, read_printed
+from pipeline.app.config import load_campaign
+from pipeline.core.records import Recording, SensorCalibration, coverage_factor
+from pipeline.estimation.accelerometer.staged import STAGE_EQUATIONS as OF_ACCELEROMETER
+from pipeline.estimation.gyroscope.staged import STAGE_EQUATIONS as OF_GYROSCOPE
+from pipeline.estimation.stages import fit_stage
 from pipeline.evaluation.held_out.samples import samples_of_motion
+from pipeline.physics.measurement import linear_truth
+from pipeline.physics.signal.filters import apply_filter
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import read_description
 
 CAMPAIGN = Path(__file__).parents[2] / "data" / "thesis"
 PRINTED = CAMPAIGN / "printed"

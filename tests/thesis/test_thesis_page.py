@@ -9,12 +9,12 @@ import pytest
 from unit_settings import filter_of
 
 from imu_logs.yaml_file import read_yaml
-from pipeline.core.records import Recording
-from pipeline.physics.signal.filters import apply_filter
 from imu_research.thesis.findings import CONFIRMED, REFUTED, agreements, conclusions, gain_of_filter, scatters
 from imu_research.thesis.page import key_of, render
 from imu_research.thesis.seeds import INTERVAL_S, TIME_CONSTANT_S, sets_of
 from imu_research.thesis.tables import Results, all_tables, with_differences
+from pipeline.core.records import Recording
+from pipeline.physics.signal.filters import apply_filter
 
 CAMPAIGN = Path(__file__).parents[2] / "data" / "thesis"
 ROWS = pd.read_csv(CAMPAIGN / "seeds.csv")

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from unit_settings import settings_of, with_noise
 
-from pipeline.evaluation.diagnosis.verdict import DISAGREES
+from pipeline.core.records import Recording, SensorCalibration
 from pipeline.estimation import effects, reference_least_squares
 from pipeline.estimation.noise import estimate_noise
-from pipeline.core.records import Recording, SensorCalibration
+from pipeline.evaluation.diagnosis.verdict import DISAGREES
+from pipeline.evaluation.held_out.heldout import validate
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
-from pipeline.evaluation.held_out.heldout import validate
 from tests.published import diagnose
 
 SETTINGS = settings_of(sensor="mpu6050", table="acutronic", procedure={"holdout_every": 3})

@@ -9,10 +9,10 @@ import pytest
 from scipy.signal import lfilter
 from unit_settings import filter_of, settings_of
 
+from pipeline.core.records import FittedEffect, Multiply, Noise, Recording, SensorCalibration, StageResult, Subtract
 from pipeline.physics.effects import effect
 from pipeline.physics.kinematics import earth_rate, reference_motion
 from pipeline.physics.measurement import compensate, predicted_reading
-from pipeline.core.records import FittedEffect, Multiply, Noise, Recording, SensorCalibration, StageResult, Subtract
 from pipeline.physics.signal.filters import apply_filter
 from tests.published import validate
 

@@ -10,9 +10,9 @@ from bench_session import Session, record
 from stage_files import documents, write_pack
 
 from pipeline.app.config.compose import Composer
-from pipeline.ingest.arrow import to_parquet
-from pipeline.core.records import SENSORS, SensorCalibration
 from pipeline.app.steps import batch
+from pipeline.core.records import SENSORS, SensorCalibration
+from pipeline.ingest.arrow import to_parquet
 from pipeline.unit import STEPS
 from tests.published import TESTED, validation_document
 

@@ -18,20 +18,20 @@ import pytest
 from whole_run import run_campaign, run_jobs
 
 import pipeline
-from pipeline import results_folder
+from pipeline.app import results_folder
 from pipeline.app.commands import add, apply, convert, explain, unpack
 from pipeline.app.config import load_campaign, settings_of_jobs
 from pipeline.app.config.campaign import Campaign
-from pipeline.evaluation.diagnosis.words import in_words
-from pipeline.core.errors import ConfigurationError, DamagedFileError, InputError
-from pipeline.core.files import json_text
 from pipeline.app.one_unit import try_unit, unit_of_campaign
-from pipeline.output.outcome import outcome
-from pipeline.core.pack import Batch, Pack
 from pipeline.app.results_folder import release_locks
-from pipeline.core.settings import Settings
 from pipeline.app.steps import batch, diagnose, gather, report
 from pipeline.app.steps.unit_files import StoredUnit
+from pipeline.core.errors import ConfigurationError, DamagedFileError, InputError
+from pipeline.core.files import json_text
+from pipeline.core.pack import Batch, Pack
+from pipeline.core.settings import Settings
+from pipeline.evaluation.diagnosis.words import in_words
+from pipeline.output.outcome import outcome
 from pipeline.unit import Task, run_step
 
 from .schemas import violations

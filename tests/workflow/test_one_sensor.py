@@ -16,8 +16,8 @@ import pipeline
 from pipeline.app.commands import apply, simulate
 from pipeline.app.config import load_campaign
 from pipeline.core.errors import ConfigurationError
-from pipeline.ingest.write import write_recording
 from pipeline.core.records import Recording
+from pipeline.ingest.write import write_recording
 
 from .conftest import Bench
 

@@ -13,8 +13,8 @@ from whole_run import run_campaign
 import pipeline
 from pipeline.app.commands import apply, check, explain, simulate
 from pipeline.app.config import load_campaign
-from pipeline.physics.effects import forget
 from pipeline.core.pack import Batch
+from pipeline.physics.effects import forget
 
 from .conftest import Bench
 

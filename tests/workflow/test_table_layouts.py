@@ -11,8 +11,8 @@ import pytest
 from whole_run import run_campaign
 
 from pipeline.app.commands import simulate
-from pipeline.core.pack import Pack
 from pipeline.app.steps.unit_files import recordings_of
+from pipeline.core.pack import Pack
 
 from .conftest import Bench
 

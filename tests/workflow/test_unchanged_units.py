@@ -8,9 +8,9 @@ import pytest
 from whole_run import run_campaign
 
 from pipeline.app.commands import simulate
-from pipeline.core.settings import Settings
 from pipeline.app.steps import batch, prior
 from pipeline.app.steps.unit_files import StoredUnit
+from pipeline.core.settings import Settings
 from pipeline.unit import Task
 
 pytestmark = pytest.mark.workflow

@@ -16,12 +16,12 @@ pytestmark = [
     pytest.mark.workflow,
     pytest.mark.skipif(int(version("setuptools").split(".")[0]) < 77, reason="setuptools>=77 builds the wheel"),
 ]
-BUILT_FROM = ("pipeline", "imu_calibration", "imu_logs", "configs", "workflow", "profiles", "data/demo")
+BUILT_FROM = ("pipeline", "imu_calibration", "imu_logs", "imu_research", "configs", "workflow", "profiles", "data/demo")
 OF_THE_TOP = (
     "pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE", "Snakefile", "CHANGELOG.md",
     "requirements.lock",
 )  # fmt: skip
-PACKAGES, SHIPPED = BUILT_FROM[:3], BUILT_FROM[3:]
+PACKAGES, SHIPPED = BUILT_FROM[:4], BUILT_FROM[4:]
 PIPELINE = ("-m", "pipeline")
 BUILD = "import sys; from setuptools import build_meta as b; to = sys.argv[1]; b.build_wheel(to); b.build_sdist(to)"
 
@@ -85,8 +85,10 @@ def run(installed: Path, folder: Path, *words: str) -> str:
 
 def test_the_installed_package_has_two_names(installed: Path, tmp_path: Path) -> None:
     for first, second in (("imu_calibration", "pipeline"), ("pipeline", "imu_calibration")):
-        code = f"import {first}, {second}, {second}.errors; from {first}.errors import PipelineError as error; "
-        code += f"print({first} is {second}, error is {second}.errors.PipelineError, {first}.__file__)"
+        code = (
+            f"import {first}, {second}, {second}.core.errors; from {first}.core.errors import PipelineError as error; "
+        )
+        code += f"print({first} is {second}, error is {second}.core.errors.PipelineError, {first}.__file__)"
         assert run(installed, tmp_path, "-c", code).split() == ["True", "True", f"{installed}/pipeline/__init__.py"]
     by_one, by_other = (run(installed, tmp_path, "-m", name, "--version") for name in ("imu_calibration", "pipeline"))
     assert by_one == by_other

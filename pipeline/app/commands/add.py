@@ -17,11 +17,11 @@ from pipeline.app.config.devices import edit_effects, sensor_and_effect
 from pipeline.app.config.owner import require_own_results
 from pipeline.core.errors import ConfigurationError, MissingInputError, PipelineError, shortened
 from pipeline.core.files import write_atomically
-from pipeline.physics.effects import catalogue
-from pipeline.output.outcome import DEFAULT_RESULTS, NAMED_PER_LINE, changes_of, read_summary, run_command
 from pipeline.core.pack import read_published
 from pipeline.core.records import SENSORS
 from pipeline.core.verdicts import Verdict
+from pipeline.output.outcome import DEFAULT_RESULTS, NAMED_PER_LINE, changes_of, read_summary, run_command
+from pipeline.physics.effects import catalogue
 
 if TYPE_CHECKING:
     import argparse

@@ -19,19 +19,19 @@ from pipeline.app.commands import parser_of
 from pipeline.app.commands.readings import Reading, campaign_of, config_of_log, grouped, recordings_of_files
 from pipeline.app.config.campaign import find_campaign, load_campaign
 from pipeline.app.config.options import nearest
-from pipeline.core.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, shortened
-from pipeline.core.files import write_atomically
-from pipeline.ingest.files import FILE, recording_files
-from pipeline.physics.calibration_file import LEFT_OUT_REASONS
-from pipeline.physics.sensor_file import settings_of_ranges
 from pipeline.app.one_unit import try_unit, unit_of_campaign
-from pipeline.output.outcome import NAMED_PER_LINE, as_overrides, found_mountings
 from pipeline.app.profile_detection.recording_facts import as_text, counted, facts, topic_lines
 from pipeline.app.profile_detection.sheet_proposal import proposed_sheet
 from pipeline.app.profile_detection.unit_guesses import propose
-from pipeline.core.records import SENSORS
 from pipeline.app.run_progress import Countdown
+from pipeline.core.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, shortened
+from pipeline.core.files import write_atomically
+from pipeline.core.records import SENSORS
 from pipeline.core.settings import Ingest
+from pipeline.ingest.files import FILE, recording_files
+from pipeline.output.outcome import NAMED_PER_LINE, as_overrides, found_mountings
+from pipeline.physics.calibration_file import LEFT_OUT_REASONS
+from pipeline.physics.sensor_file import settings_of_ranges
 
 if TYPE_CHECKING:
     import argparse
@@ -40,10 +40,10 @@ if TYPE_CHECKING:
     from imu_logs.columns import UnknownLog
     from imu_logs.proposal import Proposal
     from pipeline.app.config.campaign import Campaign
-    from pipeline.output.outcome import FoundMounting, Ways
     from pipeline.app.profile_detection.recording_facts import Line
     from pipeline.core.records import Recording
     from pipeline.core.settings import Sensor
+    from pipeline.output.outcome import FoundMounting, Ways
 
 MOST_IN_FULL = 3  # logs of one layout
 WIDTH = 118  # characters of a line

@@ -11,12 +11,12 @@ from imu_logs.yaml_file import read_yaml
 from pipeline.app.commands import parser_of
 from pipeline.app.config.options import LARGEST_CONFIG
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.files import CONFIGS
+from pipeline.core.records import SENSORS
 from pipeline.output.exports import formats
 from pipeline.output.exports.conversion import convert
 from pipeline.output.exports.reading import CALIBRATION, ImportedCalibration, counts_of, format_of, read_any
 from pipeline.output.exports.sensors import SensorFigures
-from pipeline.core.files import CONFIGS
-from pipeline.core.records import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,13 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.app.commands import parser_of
 from pipeline.app.commands.convert import sensor_figures
-from pipeline.evaluation.diagnosis.words import in_words
+from pipeline.app.results_folder import is_owner, read_owner
 from pipeline.core.errors import InputError, MissingInputError
+from pipeline.core.files import JSON, read_json
+from pipeline.core.pack import batches_of, is_published, read_published
+from pipeline.core.records import SENSORS
+from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, error_of, problems
+from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.output.exports.conversion import explain_board, explain_calibration
 from pipeline.output.exports.reading import counts_of, read_any
-from pipeline.core.files import JSON, read_json
 from pipeline.output.history import read_history
-from pipeline.physics.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 from pipeline.output.outcome import (
     NOT_CONVERGED,
     all_well,
@@ -31,11 +34,8 @@ from pipeline.output.outcome import (
     ratio_words,
     read_summary,
 )
-from pipeline.core.pack import batches_of, is_published, read_published
-from pipeline.core.records import SENSORS
 from pipeline.output.pages.pages import template
-from pipeline.app.results_folder import is_owner, read_owner
-from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, error_of, problems
+from pipeline.physics.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.app.commands import parser_of
+from pipeline.app.planning.changes import readme
 from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.files import CONFIGS
-from pipeline.ingest.recordings_sheet import EXAMPLE
-from pipeline.physics.sensor_file import settings_of_ranges
-from pipeline.output.outcome import run_command
-from pipeline.app.planning.changes import readme
 from pipeline.core.records import SENSOR_UNITS, SENSORS
+from pipeline.ingest.recordings_sheet import EXAMPLE
+from pipeline.output.outcome import run_command
 from pipeline.output.pages.pages import template
+from pipeline.physics.sensor_file import settings_of_ranges
 from pipeline.simulation.description import UnitDescription, read_option, shipped_settings
 from pipeline.simulation.procedures import TABLE_PROCEDURES
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 from pipeline.app.commands import parser_of
 from pipeline.app.commands.readings import Reading, config_of_log
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.files import JSON, json_text, write_atomically
+from pipeline.core.records import AXES, SENSORS
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.output.exports import ExportedUnit, export, formats
 from pipeline.output.exports.sensors import SensorFigures
-from pipeline.core.files import JSON, json_text, write_atomically
-from pipeline.core.records import AXES, SENSORS
 from pipeline.output.pages.noise_section import remarks, term_rows
 from pipeline.output.pages.numbers import MINUS, aligned, number
 

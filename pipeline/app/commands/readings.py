@@ -14,12 +14,12 @@ from imu_logs.files import SUFFIXES, ZIP, is_message_log
 from imu_logs.profile import checks_of
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.options import Problem, nearest
+from pipeline.checks.checks import check_recordings
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
+from pipeline.core.settings import RecordingFile, Settings
 from pipeline.ingest.files import FILE, candidate_files, parts_of
 from pipeline.ingest.read import read_table, to_recording
-from pipeline.checks.checks import check_recordings
-from pipeline.core.settings import RecordingFile, Settings
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:

@@ -9,11 +9,6 @@ from typing import TYPE_CHECKING
 from pipeline.app.commands import parser_of
 from pipeline.app.config.campaign import find_campaign
 from pipeline.app.config.owner import require_own_results
-from pipeline.core.errors import ConfigurationError, MissingInputError
-from pipeline.core.files import flushed_together, write_atomically
-from pipeline.output.history import read_history
-from pipeline.core.pack import PACKS, batches_of
-from pipeline.output.pages.pages import linked
 from pipeline.app.results_folder import (
     NEW_FOLDER,
     BusyError,
@@ -25,6 +20,11 @@ from pipeline.app.results_folder import (
     take_run,
 )
 from pipeline.app.steps.gather import publish_histories
+from pipeline.core.errors import ConfigurationError, MissingInputError
+from pipeline.core.files import flushed_together, write_atomically
+from pipeline.core.pack import PACKS, batches_of
+from pipeline.output.history import read_history
+from pipeline.output.pages.pages import linked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

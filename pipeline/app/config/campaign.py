@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
+from imu_logs.units import SENSORS
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import as_list, load_layers
 from pipeline.app.config.options import GROUPS, RUN_SETTINGS, Problem, mapping_of, nearest, parse
@@ -40,7 +41,6 @@ from pipeline.app.config.stage_settings import last_stage
 from pipeline.app.config.user_effects import PYTHON
 from pipeline.core.errors import ConfigurationError, shortened
 from pipeline.core.files import CONFIGS, JSON, SHIPPED, canonical_json
-from pipeline.output.history import SENSORS
 from pipeline.core.settings import RunSettings
 from pipeline.unit import EFFECTS_STAGE
 

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from pydantic import ValidationError
 
 from imu_logs.profile import checks_of, csv_formats, mcap_formats
+from imu_logs.units import SENSORS
 from pipeline.app.config.options import (
     GROUPS,
     RUN_SETTINGS,
@@ -43,14 +44,24 @@ from pipeline.app.config.user_effects import (
     with_given,
 )
 from pipeline.core.errors import ConfigurationError
-from pipeline.estimation.stages import NOT_WANTED, check_stages, declared
 from pipeline.core.files import CONFIGS, state_of_files
-from pipeline.output.history import SENSORS
+from pipeline.core.settings import (
+    OF_BENCH,
+    SECTIONS,
+    Ingest,
+    Method,
+    Procedure,
+    Section,
+    Sensor,
+    Settings,
+    Stages,
+    Unit,
+)
+from pipeline.core.user_cache import from_cache, to_cache
+from pipeline.estimation.stages import NOT_WANTED, check_stages, declared
 from pipeline.ingest.files import candidate_files
 from pipeline.ingest.recordings_sheet import with_sheet
 from pipeline.physics.sensor_file import completed, range_settings, without_overridden
-from pipeline.core.settings import OF_BENCH, SECTIONS, Ingest, Method, Procedure, Section, Sensor, Settings, Stages, Unit
-from pipeline.core.user_cache import from_cache, to_cache
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import yaml
 
+from imu_logs.units import SENSORS
 from pipeline.app.config.layers import DEVICES_FOLDER, key_of
 from pipeline.app.config.options import Problem, nearest, parse
 from pipeline.core.errors import ConfigurationError
-from pipeline.output.history import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

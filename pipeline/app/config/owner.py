@@ -19,10 +19,6 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.app.config.campaign import load_campaign
-from pipeline.core.errors import PipelineError, shortened
-from pipeline.core.files import read_json
-from pipeline.ingest.digests import digests_in_pack, digests_of_entries, digests_of_files
-from pipeline.core.pack import Pack, read_published
 from pipeline.app.results_folder import (
     BESIDE,
     NEW_FOLDER,
@@ -40,6 +36,10 @@ from pipeline.app.results_folder import (
     write_owner,
 )
 from pipeline.app.run_progress import Countdown, wait_for_jobs
+from pipeline.core.errors import PipelineError, shortened
+from pipeline.core.files import read_json
+from pipeline.core.pack import Pack, read_published
+from pipeline.ingest.digests import digests_in_pack, digests_of_entries, digests_of_files
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

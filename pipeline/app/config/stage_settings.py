@@ -14,11 +14,12 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from imu_logs.units import SENSORS
 from pipeline.app.config.user_effects import GIVEN, effects_for
 from pipeline.core.files import CONFIGS, canonical_json
-from pipeline.output.history import SENSORS, digest
-from pipeline.ingest.files import state_of_recordings
 from pipeline.core.settings import OF_BENCH, Board, Settings, Stated, Unit
+from pipeline.ingest.files import state_of_recordings
+from pipeline.output.history import digest
 from pipeline.unit import EFFECTS_STAGE, STEPS
 
 if TYPE_CHECKING:
@@ -26,13 +27,14 @@ if TYPE_CHECKING:
 
     from pipeline.app.config.campaign import Campaign, UnitRow
 
-PACKAGE = Path(__file__).resolve().parents[1]
-PACKAGES = ("pipeline", "imu_logs")  # beside each other, in a clone and in a wheel
+PACKAGE = Path(__file__).resolve().parents[2]
+PACKAGES = ("pipeline", "imu_logs", "imu_research")  # beside each other, in a clone and in a wheel
 CAMPAIGN = "campaign"  # cannot be a batch, because their names end in a number
 EFFECTS_FOLDER = CONFIGS / "effect"  # read by pipeline.physics.effects
 # An import of the package, or of jinja2: module and names, or only a module. ``ast`` takes 0.5 s for all files.
 IMPORT = re.compile(
-    r"^[ \t]*(?:from (pipeline[\w.]*|jinja2) import (\([^)]*\)|.*)|import (pipeline[\w.]*))", re.MULTILINE
+    r"^[ \t]*(?:from ((?:pipeline|imu_)[\w.]*|jinja2) import (\([^)]*\)|.*)|import ((?:pipeline|imu_)[\w.]*))",
+    re.MULTILINE,
 )
 SECTIONS_OF_STAGES = {**{name: step.settings for name, step in STEPS.items()}, "prior": STEPS["validate"].settings}
 
@@ -245,7 +247,7 @@ def _imports(file: Path) -> tuple[Path, ...]:
     files: list[Path | None] = []
     if file.name == "__init__.py" and b"import_module(" in source:
         files += [f for f in file.parent.rglob("*") if f.is_file() and f.suffix != ".pyc"]
-    if file == PACKAGE / "model" / "effects" / "__init__.py":
+    if file == PACKAGE / "physics" / "effects" / "__init__.py":
         files += [f for f in sorted(EFFECTS_FOLDER.glob("*.yaml")) if b"\nbuilt_in: true" in f.read_bytes()]
     for module, names, whole in IMPORT.findall(source.decode()):
         if module == "jinja2":

@@ -13,18 +13,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from imu_logs.files import read_text
+from imu_logs.units import SENSORS
 from imu_logs.yaml_file import MAX_YAML_BYTES
 from pipeline.app.config.options import Problem
 from pipeline.core.errors import ConfigurationError, PipelineError
 from pipeline.core.files import CONFIGS
-from pipeline.output.history import SENSORS
 from pipeline.core.settings import OF_BENCH, UserEffectFiles
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from pipeline.physics.effects.base import Effect
     from pipeline.core.settings import Sensor, Settings
+    from pipeline.physics.effects.base import Effect
 
 PYTHON = "python_effects"
 GIVEN = "given"  # name of the method

@@ -1,7 +1,7 @@
 """Compensate a log as a stream: read, compensate and write it block by block.
 
-The modules ``pipeline.app.field_logs.text_output`` and ``mcap_log`` read and write the blocks of each format. The largest
-block determines the memory; logs of other programs, and files that the profile joins, are read into memory.
+The modules ``pipeline.app.field_logs.text_output`` and ``mcap_log`` read and write the blocks of each format. The
+largest block determines the memory; logs of other programs, and files that the profile joins, are read into memory.
 
 If the user states an interval with a rest (``apply --rest``), the log is read twice, first to estimate the gyroscope's
 bias b from that rest:
@@ -9,8 +9,8 @@ bias b from that rest:
     b' = b + K m,    K = matrix^-1
 
 where m is the mean rate, calibrated with b, of the longest rest in the interval. Rests are found as in recordings by
-hand (``pipeline.physics.signal.rests``). b' is the bias at the power-on of the log. It includes Earth's rotation, at most
-0.0042 deg/s.
+hand (``pipeline.physics.signal.rests``). b' is the bias at the power-on of the log. It includes Earth's rotation, at
+most 0.0042 deg/s.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imu_logs.files import GIT_LFS, MESSAGE_FORMATS, not_regular
-from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.app.field_logs.stream import CalibratedStretch, LogProfile, LogStream, Output, Result, user_errors
+from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.physics.compensation import SMOOTHING_S
 
 if TYPE_CHECKING:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 DECIMALS = 12  # in the output of ``apply``: far below the resolution of sensors, above the rounding of a double
-TEMPERATURE, SOAKED = "temperature_degc", "soaked_degc"  # of ``calibrated_range``
+TEMPERATURE_RANGE, SOAKED = "temperature_degc", "soaked_degc"  # of ``calibrated_range``
 RANGES = {"accelerometer": "specific_force_g", "gyroscope": "angular_rate_dps"}  # of ``calibrated_range``
 # Margins of the calibrated range, by convention: the sign of the bias of a low-cost sensor, some % of 1 g, differs
 # between directions; the temperature of a room, and of a chip from one power-on to the next, changes by 1 degC.
@@ -79,7 +79,7 @@ class LogChecks:
         }
         self.soaked = self.ranges.pop(SOAKED, None)  # the temperatures within which a soak determined the bias
         if self.soaked:
-            self.ranges[TEMPERATURE] = self.soaked
+            self.ranges[TEMPERATURE_RANGE] = self.soaked
         self.extremes: dict[str, list[float]] = {}  # beyond the range: number of samples, lowest and highest value
 
     def extrapolated(self, temperature: Values) -> Mask:
@@ -89,8 +89,8 @@ class LogChecks:
 
     def require_within(self, file: str) -> None:
         """Raise ``InputError`` if samples are beyond the soaked temperatures."""
-        if self.soaked and TEMPERATURE in self.extremes:
-            count, least, most = self.extremes[TEMPERATURE]
+        if self.soaked and TEMPERATURE_RANGE in self.extremes:
+            count, least, most = self.extremes[TEMPERATURE_RANGE]
             message = (
                 f"--strict: {count:.0f} samples at {least:.1f} to {most:.1f} degC are beyond the soaked temperatures"
             )
@@ -137,10 +137,10 @@ class LogChecks:
     def _add_extremes(self, raw: Mapping[str, Values], temperature: Values | None) -> None:
         """Count the samples beyond the calibrated range."""
         values = {RANGES[s]: np.linalg.norm(v, axis=1) for s, v in raw.items()}
-        values |= {} if temperature is None else {TEMPERATURE: temperature}
+        values |= {} if temperature is None else {TEMPERATURE_RANGE: temperature}
         for key in values.keys() & self.ranges.keys():
             low, high = self.ranges[key]
-            margin = MARGIN_DEGC * (not self.soaked) if key == TEMPERATURE else RANGE_MARGIN * high
+            margin = MARGIN_DEGC * (not self.soaked) if key == TEMPERATURE_RANGE else RANGE_MARGIN * high
             beyond = values[key][(values[key] < low - margin) | (values[key] > high + margin)]
             if len(beyond):
                 count, least, most = self.extremes.get(key, [0, np.inf, -np.inf])
@@ -151,7 +151,7 @@ class LogChecks:
         warnings = []
         for key, (count, least, most) in sorted(self.extremes.items()):
             low, high = self.ranges[key]
-            if key == TEMPERATURE:
+            if key == TEMPERATURE_RANGE:
                 what = f"temperatures from {least:.1f} to {most:.1f} degC, calibrated from {low:.1f} to {high:.1f} degC"
                 todo = "soak it there" if self.soaked else "record turns at these temperatures (procedure thermal_ramp)"
             else:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 LAST_ID = 0xFFFF  # ids of added definitions count down from here, because recorders count up from 0
 SUFFIX = "_calibrated"
 METADATA = "imu_calibration"
-READINGS = {*ACCELEROMETER, *GYROSCOPE}
+READING_CHANNELS = {*ACCELEROMETER, *GYROSCOPE}
 
 
 class McapLog:
@@ -63,7 +63,7 @@ class McapLog:
         """Copy the log run by run, with the calibrated readings of each run after it."""
         topic, needed = self.settings.imu_topic, "temperature" in self.stream.stream.needs
         if self.settings.topics:
-            topics = [t for t, fields in self.settings.topics.items() if READINGS & set(fields)]
+            topics = [t for t, fields in self.settings.topics.items() if READING_CHANNELS & set(fields)]
             if len(topics) != 1:
                 message = (
                     f"the profile takes the readings from {len(topics)} topics ({', '.join(topics)}); apply needs both "
@@ -82,7 +82,7 @@ class McapLog:
                     self.temperatures.take(run.rows, self.reader)
                 for rows in run.rows:
                     decoder = self.topics.decoder_of(rows, self.reader)
-                    if decoder is not None and READINGS & set(decoder.fields):
+                    if decoder is not None and READING_CHANNELS & set(decoder.fields):
                         self._add_calibrated(rows, decoder)
         if self.readings is None:
             listed = ", ".join(text for _, text in listed_topics(self.reader))

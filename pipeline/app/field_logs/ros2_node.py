@@ -21,11 +21,11 @@ import numpy as np
 
 from imu_logs.mcap_write import VECTORS
 from pipeline.core.errors import PipelineError
+from pipeline.core.records import SENSORS
 from pipeline.ingest.axis_maps import axis_matrix, maps_of_log
 from pipeline.physics.calibration_file import read_calibration
 from pipeline.physics.compensation import SMOOTHING_S, load
 from pipeline.physics.log_motion import ExponentialRegression
-from pipeline.core.records import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -9,11 +9,11 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from imu_logs.units import ACCELEROMETER, CANONICAL, GYROSCOPE, UNITS
-from pipeline.core.errors import ConfigurationError, InputError, PipelineError
 from pipeline.app.field_logs.log_checks import LogChecks
-from pipeline.ingest.axis_maps import STRAIGHT, axis_matrix, in_body_axes, maps_of_log
+from pipeline.core.errors import ConfigurationError, InputError, PipelineError
 from pipeline.core.records import SENSORS, Recording
 from pipeline.core.settings import Ingest
+from pipeline.ingest.axis_maps import STRAIGHT, axis_matrix, in_body_axes, maps_of_log
 from pipeline.physics.signal.rests import find_rests
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.physics.compensation import Compensation
     from pipeline.core.records import Values
+    from pipeline.physics.compensation import Compensation
 
     Readings = dict[str, NDArray[Any]]
 

@@ -24,8 +24,8 @@ from imu_logs.text_layout import TextLayout, find_faults, other_separator
 from imu_logs.text_lines import TextLog
 from imu_logs.text_write import text_scalar, times_as_decimals, to_arrow, to_numpy
 from imu_logs.units import ACCELEROMETER, CANONICAL, COUNTS, GYROSCOPE, SECOND_NS, SINCE_1970_NS, TRIADS, UNITS
-from pipeline.core.errors import InputError
 from pipeline.app.field_logs.log_checks import DECIMALS
+from pipeline.core.errors import InputError
 from pipeline.core.records import SENSORS
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 EXTRAPOLATED = "extrapolated"  # 1 where a row is beyond the soaked temperatures, else 0
 BLOCK_ROWS = 20_000  # of a message log, like a block of a text log
-SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
+CHANNELS_OF_SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
 
 
 class CsvLog:
@@ -102,7 +102,9 @@ class CsvLog:
             raise InputError(message, f"{self.source}:1")
         self._find(head.names, f"{self.source}:{head.line}")
         places = [
-            (self.columns[c], i) for s, where in self.places.items() for c, i in zip(SIGNALS[s], where, strict=True)
+            (self.columns[c], i)
+            for s, where in self.places.items()
+            for c, i in zip(CHANNELS_OF_SIGNALS[s], where, strict=True)
         ]
         self.layout = TextLayout(str(self.source), head.names, places, head.delimiter, self.settings.decimal)
         new = list(head.names)
@@ -114,7 +116,7 @@ class CsvLog:
 
     def _find(self, names: list[str], where: str) -> None:
         """Find the columns of the signals by the names in the header; ``where``: its place, for messages."""
-        for signal, channels in SIGNALS.items():
+        for signal, channels in CHANNELS_OF_SIGNALS.items():
             expected = [self.columns[c] for c in channels if c in self.columns]
             present = {str(c.column): index for c in expected if (index := c.index(names)) is not None}
             twice = [name for name in present if names.count(name) > 1]
@@ -155,7 +157,7 @@ class CsvLog:
         signals: dict[str, Any] = {}
         for signal, where in self.places.items():
             numbers = np.column_stack([self._numbers(cells[i]) for i in where])
-            for k, channel in enumerate(SIGNALS[signal]):
+            for k, channel in enumerate(CHANNELS_OF_SIGNALS[signal]):
                 column = self.columns[channel]
                 if channel != "time" or column.unit == COUNTS:
                     numbers[:, k] = in_house_unit(column, numbers[:, k])

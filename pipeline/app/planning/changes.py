@@ -4,7 +4,8 @@ Each proposed change is planned like the procedure itself. Changes with options 
 options. The others are further recordings, to be named in the procedure's configuration.
 
 The README states how to mount and record a unit, the lengths of the recordings, and what they determine. It takes the
-recordings and lengths from the simulated procedure, and what they determine from its plan (``pipeline.app.planning.plan``).
+recordings and lengths from the simulated procedure, and what they determine from its plan
+(``pipeline.app.planning.plan``).
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.physics.effects import effect
-from pipeline.physics.effects.base import Owner
-from pipeline.physics.kinematics import LEVEL_AT_ZERO
 from pipeline.app.planning.plan import Document, plan_of, share_text, size_text
 from pipeline.core.records import AXES, SENSORS
 from pipeline.output.pages.pages import template
+from pipeline.physics.effects import effect
+from pipeline.physics.effects.base import Owner
+from pipeline.physics.kinematics import LEVEL_AT_ZERO
 from pipeline.physics.signal.rests import SETTLING_S
 from pipeline.simulation.description import UnitDescription, course_of, shipped_settings
 from pipeline.simulation.procedures import TABLE_PROCEDURES, Course, plan

@@ -42,8 +42,8 @@ from pipeline.estimation.selection import DELAYS, LOOK_ALIKE_SHARE, Selection
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.core.records import Mask, Noise, Values
+    from pipeline.estimation.multi_position import selection as by_hand
 
 BISECTION_STEPS = 14  # of bisection: a factor of 1e11 to 0.2 %
 MIN_LIMIT_SHARE, MAX_LIMIT_SHARE = 1e-8, 1e3  # share of the limits

@@ -50,12 +50,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import AXES, BIAS, NotCalibrated, Recording, SensorCalibration, Values, coverage_factor
 from pipeline.estimation.accelerometer.nonlinear_least_squares import IDEAL, LOWER_COLUMNS, LOWER_ROWS, PLACE, triangle
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, limit_of_misalignment
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
 from pipeline.estimation.multi_position.moves import sound_span
 from pipeline.estimation.rest_means import ROLE, Orientations, holdout_interval, orientations_of, rest_means
-from pipeline.core.records import AXES, BIAS, NotCalibrated, Recording, SensorCalibration, Values, coverage_factor
 from pipeline.physics.signal.rests import WINDOW_S, Rest, find_rests
 from pipeline.physics.signal.segments import multiples, turns_by_hand
 from pipeline.simulation.trajectory import rotation_by

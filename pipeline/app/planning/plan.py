@@ -19,19 +19,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.evaluation.diagnosis.multi_position import require_model
-from pipeline.evaluation.diagnosis.observability import at_its_limit, not_observable, not_observable_by_hand
+from pipeline.app.planning.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import SENSORS, Noise, NotCalibrated, Recording, SensorCalibration
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
+from pipeline.evaluation.diagnosis.multi_position import require_model
+from pipeline.evaluation.diagnosis.observability import at_its_limit, not_observable, not_observable_by_hand
+from pipeline.output.pages.pages import template
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import unit_of
 from pipeline.physics.sensor_file import assumed_figures
-from pipeline.app.planning.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
-from pipeline.core.records import SENSORS, Noise, NotCalibrated, Recording, SensorCalibration
-from pipeline.output.pages.pages import template
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, course_of, shipped_settings
 from pipeline.unit import run_checked

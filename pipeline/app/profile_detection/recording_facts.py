@@ -17,12 +17,12 @@ from imu_logs.message_layout import short_name
 from imu_logs.message_logs import open_reader
 from imu_logs.message_read import LONGEST_ARRAY
 from imu_logs.units import DEGREES, TRIADS
+from pipeline.app.profile_detection.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
+from pipeline.checks.bench import other_axes
 from pipeline.core.errors import IngestError
+from pipeline.core.records import AXES, SENSOR_UNITS, SENSORS
 from pipeline.ingest.gravity_rotation import FAILS_DEG, FITS_DEG, misfit_deg, moves_of, rests_of
 from pipeline.ingest.quality_flags import CLIPPED, GAP, REST_LIMITS, STUCK, equal_share
-from pipeline.checks.bench import other_axes
-from pipeline.app.profile_detection.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
-from pipeline.core.records import AXES, SENSOR_UNITS, SENSORS
 from pipeline.physics.signal.rests import SHORTEST_REST_S, rests_from_table, runs
 
 if TYPE_CHECKING:
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
     from mcap.records import Channel, Schema
 
-    from pipeline.ingest.gravity_rotation import MoveByHand
     from pipeline.core.records import Note, Recording, Values
     from pipeline.core.settings import Sensor
+    from pipeline.ingest.gravity_rotation import MoveByHand
 
 MAX_SEARCHED_SAMPLES = 500_000  # searched for rests and moves
 MIN_VARIANCE_SAMPLES = 3  # of a rest, for a variance

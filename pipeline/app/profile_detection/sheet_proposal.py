@@ -23,9 +23,9 @@ import numpy as np
 from imu_logs.files import SUFFIXES
 from imu_logs.profile import checks_of
 from pipeline.core.errors import IngestError
-from pipeline.ingest.read import read_table, to_recording
 from pipeline.core.records import AXES, NOISE_OF_ROWS, Recording, median
 from pipeline.core.settings import RecordingFile
+from pipeline.ingest.read import read_table, to_recording
 from pipeline.physics.signal.rests import find_rests
 from pipeline.physics.signal.segments import MAX_AXIS_SINE
 

@@ -1,7 +1,7 @@
 """Run a stage on a batch of units, one after the other; a unit that fails does not stop the others.
 
-A job reads and writes one file for each stage, a ``pipeline.core.pack``. It contains ``<unit>.failed.json`` for a failed
-unit. Later stages copy this member, and ``verdict`` sets the exit code from it.
+A job reads and writes one file for each stage, a ``pipeline.core.pack``. It contains ``<unit>.failed.json`` for a
+failed unit. Later stages copy this member, and ``verdict`` sets the exit code from it.
 
 A stage after the fit (``AFTER_FIT``) that fails for a unit does not fail the unit: its calibration is published. The
 pack then contains what the function ``<stage>_without`` of the stage returns instead, and ``<unit>.incomplete.json``
@@ -21,12 +21,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.app.results_folder import hold_as_job, record_written, repetitions
+from pipeline.app.steps import MODULES
 from pipeline.core.errors import DamagedFileError, PipelineError, failure_of, is_of_run, omission
 from pipeline.core.files import read_json, write_json
 from pipeline.core.pack import FAILED, INCOMPLETE, Files, Pack, as_bytes, new_pack
-from pipeline.app.results_folder import hold_as_job, record_written, repetitions
 from pipeline.core.settings import Settings, UserEffectFiles
-from pipeline.app.steps import MODULES
 from pipeline.unit import EFFECTS_STAGE, STEPS, Task, run_step
 
 if TYPE_CHECKING:

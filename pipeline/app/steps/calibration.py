@@ -13,15 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.app.steps.unit_files import StoredUnit
 from pipeline.core.errors import CannotCalibrateError, NotObservableError, PipelineError
-from pipeline.estimation.chip_fit import Chip
-from pipeline.estimation.chips import chip_document
-from pipeline.estimation.frame import frame_uncertainty
-from pipeline.estimation.noise_identification import identify_noise
-from pipeline.ingest.axis_maps import axis_maps
-from pipeline.ingest.quality_flags import GAP
-from pipeline.physics.calibration_file import beyond_limits, implausible, not_determined
-from pipeline.physics.open_effects import with_open
 from pipeline.core.pack import FAILED
 from pipeline.core.records import (
     SCHEMA_VERSION,
@@ -32,15 +25,22 @@ from pipeline.core.records import (
     Validation,
     calibrated,
 )
-from pipeline.app.steps.unit_files import StoredUnit
 from pipeline.core.version import VERSION
+from pipeline.estimation.chip_fit import Chip
+from pipeline.estimation.chips import chip_document
+from pipeline.estimation.frame import frame_uncertainty
+from pipeline.estimation.noise_identification import identify_noise
+from pipeline.ingest.axis_maps import axis_maps
+from pipeline.ingest.quality_flags import GAP
+from pipeline.physics.calibration_file import beyond_limits, implausible, not_determined
+from pipeline.physics.open_effects import with_open
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.app.steps.batch import Job
     from pipeline.core.records import Fit
     from pipeline.core.settings import Board, DataSheet, Settings
-    from pipeline.app.steps.batch import Job
 
 MOVE = "record turns of 100 deg/s and more about all axes"
 LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")

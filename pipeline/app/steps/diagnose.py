@@ -5,21 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from pipeline.evaluation.diagnosis.diagnose import diagnose, without_diagnosis
-from pipeline.evaluation.diagnosis.effective_noise import effective_noise
+from pipeline.app.steps.unit_files import StoredUnit
 from pipeline.core.errors import omission
+from pipeline.core.records import SCHEMA_VERSION, SensorDiagnosis, Validation, calibrated
 from pipeline.estimation.known_effects import without_known_effects
 from pipeline.estimation.noise import required_noises
-from pipeline.core.records import SCHEMA_VERSION, SensorDiagnosis, Validation, calibrated
-from pipeline.app.steps.unit_files import StoredUnit
+from pipeline.evaluation.diagnosis.diagnose import diagnose, without_diagnosis
+from pipeline.evaluation.diagnosis.effective_noise import effective_noise
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from pipeline.app.steps.batch import Job
     from pipeline.core.pack import Files
     from pipeline.core.records import Fit, Noise, SensorCalibration, UnitRecordings
     from pipeline.core.settings import Settings
-    from pipeline.app.steps.batch import Job
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from pipeline.core.errors import PipelineError, failure_of
-from pipeline.core.files import JSON, flushed_together, read_json, write_atomically, write_json
-from pipeline.output.history import of_units, record
-from pipeline.ingest.digests import digests_in_pack
-from pipeline.core.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch, Pack, as_bytes, batches_of, is_published
-from pipeline.output.pages.campaign_page import render
-from pipeline.output.pages.comparison import against_truth, section
-from pipeline.output.pages.fleet import fleet_statistics, parameter_table, write_parameters, write_summary
-from pipeline.output.pages.parameters import Parameter
-from pipeline.output.pages.run_section import runs_data, times_of, with_history
 from pipeline.app.results_folder import (
     NEW_FOLDER,
     PUBLISHED_PATHS,
@@ -33,7 +23,17 @@ from pipeline.app.results_folder import (
     record_units,
 )
 from pipeline.app.steps.summary import failed_files, failed_summary
+from pipeline.core.errors import PipelineError, failure_of
+from pipeline.core.files import JSON, flushed_together, read_json, write_atomically, write_json
+from pipeline.core.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch, Pack, as_bytes, batches_of, is_published
 from pipeline.core.version import VERSION
+from pipeline.ingest.digests import digests_in_pack
+from pipeline.output.history import of_units, record
+from pipeline.output.pages.campaign_page import render
+from pipeline.output.pages.comparison import against_truth, section
+from pipeline.output.pages.fleet import fleet_statistics, parameter_table, write_parameters, write_summary
+from pipeline.output.pages.parameters import Parameter
+from pipeline.output.pages.run_section import runs_data, times_of, with_history
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -9,19 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from imu_logs.files import unchanged
+from pipeline.checks.checks import check_recordings
 from pipeline.core.errors import IngestError, PipelineError, failure_of
+from pipeline.core.pack import FAILED, Pack, as_bytes, new_pack
 from pipeline.ingest.files import candidate_files, recording_files, state_of_recordings
 from pipeline.ingest.read import read_recordings
-from pipeline.core.pack import FAILED, Pack, as_bytes, new_pack
-from pipeline.checks.checks import check_recordings
 from pipeline.physics.signal.segments import cut, held_out_windows
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from pipeline.app.steps.batch import Job
     from pipeline.core.records import Recording
     from pipeline.core.settings import Settings
-    from pipeline.app.steps.batch import Job
     from pipeline.unit import UnitFiles
 
 

@@ -90,8 +90,8 @@ def _prepare() -> None:
 
     from pipeline.evaluation.diagnosis import words  # noqa: PLC0415
     from pipeline.output.exports import formats  # noqa: PLC0415
-    from pipeline.physics.effects import built_in  # noqa: PLC0415
     from pipeline.output.pages.pages import compile_templates  # noqa: PLC0415
+    from pipeline.physics.effects import built_in  # noqa: PLC0415
 
     built_in()
     formats()

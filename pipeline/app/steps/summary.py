@@ -8,17 +8,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.core.errors import PipelineError
-from pipeline.output.history import unit_state
+from pipeline.core.settings import Stated
 from pipeline.ingest.digests import digests_of_entries
+from pipeline.output.history import unit_state
 from pipeline.output.pages.pages import failure_page
 from pipeline.output.pages.parameters import sheet_columns, summary_row, unit_parameters
-from pipeline.core.settings import Stated
 
 if TYPE_CHECKING:
+    from pipeline.app.steps.batch import Job
     from pipeline.core.files import JSON
     from pipeline.core.pack import Files, Pack
     from pipeline.core.settings import Sensor, Settings
-    from pipeline.app.steps.batch import Job
 
 KEPT = ("schema_version", "sensor", "table", "procedure", "method", "config_sha256", "software")
 

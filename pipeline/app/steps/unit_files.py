@@ -6,17 +6,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.ingest.arrow import from_parquet, to_parquet
 from pipeline.core.pack import INCOMPLETE, Pack
 from pipeline.core.records import SENSORS, Noise, UnitRecordings, Validation, fit_from_json
+from pipeline.ingest.arrow import from_parquet, to_parquet
 from pipeline.unit import UnitFiles
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from pipeline.app.steps.batch import Job
     from pipeline.core.pack import Files
     from pipeline.core.records import Fit, Recording
-    from pipeline.app.steps.batch import Job
 
 
 def recordings_of(packs: Mapping[str, Pack], unit: str) -> list[Recording]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.estimation.noise import required_noises
 from pipeline.core.records import SensorValidation, Validation, calibrated
+from pipeline.estimation.noise import required_noises
 from pipeline.evaluation.held_out.attitude import attitude, gravity_direction
 from pipeline.evaluation.held_out.heldout import validate
 

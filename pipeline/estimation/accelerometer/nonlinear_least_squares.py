@@ -25,6 +25,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import (
+    AXES,
+    BASE_COUNT,
+    BIAS,
+    MATRIX,
+    Estimate,
+    Multiply,
+    Noise,
+    NoMonteCarlo,
+    SensorCalibration,
+    StageResult,
+    Subtract,
+    Values,
+    base_units,
+    base_values,
+    coverage_factor,
+)
 from pipeline.estimation.at_limits import changes_on_table
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE_SETTING, WanderPrior
@@ -61,23 +78,6 @@ from pipeline.estimation.uncertainty_budget import (
     stage_parameters,
 )
 from pipeline.physics.kinematics import table_motion
-from pipeline.core.records import (
-    AXES,
-    BASE_COUNT,
-    BIAS,
-    MATRIX,
-    Estimate,
-    Multiply,
-    Noise,
-    NoMonteCarlo,
-    SensorCalibration,
-    StageResult,
-    Subtract,
-    Values,
-    base_units,
-    base_values,
-    coverage_factor,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

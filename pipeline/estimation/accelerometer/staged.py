@@ -28,6 +28,21 @@ import numpy as np
 import scipy
 
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import (
+    AXES,
+    BASE,
+    BASE_COUNT,
+    Contribution,
+    CorrectionStep,
+    FittedEffect,
+    Recording,
+    SensorCalibration,
+    Subtract,
+    TwoSided,
+    Values,
+    base_values,
+    corrected,
+)
 from pipeline.estimation.accelerometer.turn_extremes import (
     AxisTurns,
     Extremes,
@@ -52,21 +67,6 @@ from pipeline.estimation.uncertainty_budget import (
     stage_parameters,
 )
 from pipeline.physics.effects import effect
-from pipeline.core.records import (
-    AXES,
-    BASE,
-    BASE_COUNT,
-    Contribution,
-    CorrectionStep,
-    FittedEffect,
-    Recording,
-    SensorCalibration,
-    Subtract,
-    TwoSided,
-    Values,
-    base_values,
-    corrected,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -37,9 +37,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import AXES, CorrectionStep, Mask, TwoSided, Values
 from pipeline.estimation.least_squares import ScaledColumns, convergence_evidence, linear_convergence_evidence
 from pipeline.estimation.turns import TurnPart, filtered_alike
-from pipeline.core.records import AXES, CorrectionStep, Mask, TwoSided, Values
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -37,16 +37,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.core.errors import NotObservableError
-from pipeline.estimation.engine import LinearMap, derivative
-from pipeline.estimation.least_squares import ScaledColumns, linear_convergence_evidence
-from pipeline.estimation.monte_carlo import with_matrix
-from pipeline.estimation.multi_position.moves import trapezoids
-from pipeline.estimation.noise import wander_prior
-from pipeline.estimation.reference_least_squares import of_channels
-from pipeline.estimation.stages import FitStage
-from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, used_motions
-from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
 from pipeline.core.records import (
     AFTER_BASE,
     AXES,
@@ -61,6 +51,16 @@ from pipeline.core.records import (
     Subtract,
     Values,
 )
+from pipeline.estimation.engine import LinearMap, derivative
+from pipeline.estimation.least_squares import ScaledColumns, linear_convergence_evidence
+from pipeline.estimation.monte_carlo import with_matrix
+from pipeline.estimation.multi_position.moves import trapezoids
+from pipeline.estimation.noise import wander_prior
+from pipeline.estimation.reference_least_squares import of_channels
+from pipeline.estimation.stages import FitStage
+from pipeline.estimation.table_errors import Reference
+from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, used_motions
+from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
 from pipeline.physics.signal.rests import runs
 
 if TYPE_CHECKING:

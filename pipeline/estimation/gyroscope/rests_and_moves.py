@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError
+from pipeline.core.records import BASE_COUNT, MATRIX, MATRIX_NAMES, Multiply, SensorCalibration, StageResult, Subtract
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.multi_position.effects import accelerometer_of, frame_error
@@ -30,15 +31,14 @@ from pipeline.estimation.multi_position.robust import fit_robustly
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of
 from pipeline.estimation.stages import FitStage
-from pipeline.core.records import BASE_COUNT, MATRIX, MATRIX_NAMES, Multiply, SensorCalibration, StageResult, Subtract
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.multi_position.fit import FitByHand
-    from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
     from pipeline.core.records import Recording, UnitRecordings, Values
     from pipeline.core.settings import DataSheet, Procedure, Settings
+    from pipeline.estimation.multi_position.fit import FitByHand
+    from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 
     Found: TypeAlias = tuple[GyroscopeModel, FitByHand, list[dict[str, Any]]]
 

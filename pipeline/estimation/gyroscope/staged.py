@@ -27,13 +27,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.engine import LinearMap, derivative
-from pipeline.estimation.least_squares import ScaledColumns, convergence_evidence
-from pipeline.estimation.noise import wander_prior
-from pipeline.estimation.stages import FitStage, staged_result
-from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, steady_turns, used_motions
-from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
 from pipeline.core.records import (
     AFTER_BASE,
     AXES,
@@ -48,6 +41,13 @@ from pipeline.core.records import (
     corrected,
     motion_at_rest,
 )
+from pipeline.estimation.engine import LinearMap, derivative
+from pipeline.estimation.least_squares import ScaledColumns, convergence_evidence
+from pipeline.estimation.noise import wander_prior
+from pipeline.estimation.stages import FitStage, staged_result
+from pipeline.estimation.table_errors import Reference
+from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, steady_turns, used_motions
+from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
 from pipeline.physics.signal.rests import runs
 
 if TYPE_CHECKING:

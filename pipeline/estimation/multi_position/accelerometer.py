@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from pipeline.core.records import BASE_COUNT
 from pipeline.estimation.multi_position.faces_and_turns import Faces, faces_of
 from pipeline.estimation.multi_position.limits import limit_block
 from pipeline.estimation.multi_position.model import (
@@ -39,14 +40,13 @@ from pipeline.estimation.multi_position.model import (
 )
 from pipeline.estimation.multi_position.soaks import Soaks, parted
 from pipeline.estimation.rest_means import HELD_OUT, Rests, rests_of
-from pipeline.core.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.design import EffectColumns
     from pipeline.core.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
     from pipeline.core.settings import DataSheet, Settings
+    from pipeline.estimation.design import EffectColumns
 
 FORCE_ITERATIONS = 12  # of effects that depend on the force
 SETTLED_FORCE_G = 1e-12  # g

@@ -22,9 +22,9 @@ from pipeline.physics.effects import effect
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.multi_position.model import Model
     from pipeline.core.records import Noise, Recording, SensorCalibration, UnitRecordings
     from pipeline.core.settings import Settings
+    from pipeline.estimation.multi_position.model import Model
 
 
 def accelerometer_of(recordings: UnitRecordings, settings: Settings) -> SensorCalibration | None:

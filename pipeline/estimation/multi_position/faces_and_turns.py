@@ -26,19 +26,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, Values
 from pipeline.estimation.multi_position.model import EquationBlock, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import padded, tangents, trapezoids
 from pipeline.estimation.multi_position.stated_turns import name_of_axis, stated_turns
 from pipeline.estimation.rest_means import ROLE, Rests
-from pipeline.core.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, Values
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.design import EffectColumns
-    from pipeline.estimation.multi_position.stated_turns import StatedTurn
     from pipeline.core.settings import FacesByHand as StatedFaces
     from pipeline.core.settings import HandTurns, Procedure
+    from pipeline.estimation.design import EffectColumns
+    from pipeline.estimation.multi_position.stated_turns import StatedTurn
 
 NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip askew in its case, and a hand
 DEPARTS = 4.5  # standard uncertainties: two angles exceed it with a probability of 4e-5

@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from pipeline.core.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX
 from pipeline.estimation.engine import draw_normal
 from pipeline.estimation.least_squares import cholesky
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, SMALLEST_NOISE, white_of
@@ -53,16 +54,15 @@ from pipeline.estimation.multi_position.moves import (
     to_the_end,
 )
 from pipeline.physics.kinematics import skew
-from pipeline.core.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.core.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
+    from pipeline.core.settings import Procedure
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.rest_means import Rests
-    from pipeline.core.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
-    from pipeline.core.settings import Procedure
 
 MIN_MOVES = 6  # two equations each, for the nine of the matrix
 RATE_ITERATIONS = 6  # of effects that depend on the rate

@@ -24,8 +24,8 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.multi_position.model import Equations, NoiseHypothesis
     from pipeline.core.records import Values
+    from pipeline.estimation.multi_position.model import Equations, NoiseHypothesis
 
 # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 MIN_NEW_NORM_SHARE = 1e-3

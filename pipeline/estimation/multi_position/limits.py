@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.multi_position.model import EquationBlock
 from pipeline.core.records import base_values
+from pipeline.estimation.multi_position.model import EquationBlock
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -35,10 +35,10 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import scipy
 
+from pipeline.core.records import BIAS, Index, Mask, Motion, Noise, Values, matrix_of
 from pipeline.estimation import design
 from pipeline.estimation.gauss_markov import NO_INSTABILITY_ODDS, Setting, WanderPrior, block_covariance, selection_grid
 from pipeline.estimation.least_squares import cholesky
-from pipeline.core.records import BIAS, Index, Mask, Motion, Noise, Values, matrix_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -42,13 +42,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.records import BASE, BASE_COUNT, BIAS, MATRIX, matrix_of
 from pipeline.estimation.engine import root_of
 from pipeline.estimation.multi_position.model import motion_of
 from pipeline.estimation.rest_means import ROLE, Rests, rest_means, rests_of, sound_samples
 from pipeline.physics.effects import effect
 from pipeline.physics.kinematics import turn_by_vector
 from pipeline.physics.measurement import compensate
-from pipeline.core.records import BASE, BASE_COUNT, BIAS, MATRIX, matrix_of
 from pipeline.physics.signal.filters import filter_autocovariance, variance_of_mean
 from pipeline.physics.signal.rests import Rest
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from pipeline.core.records import Contribution, Recording, SensorCalibration, StageResult, Values, base_values
 from pipeline.estimation.at_limits import changes_by_hand, changes_through_gravity, gain_of
 from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.least_squares import convergence_evidence
@@ -38,7 +39,6 @@ from pipeline.estimation.uncertainty_budget import (
     limit_contribution,
     scatter_contribution,
 )
-from pipeline.core.records import Contribution, Recording, SensorCalibration, StageResult, Values, base_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

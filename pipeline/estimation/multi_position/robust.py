@@ -18,9 +18,9 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from pipeline.core.records import Recording, Values
     from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
-    from pipeline.core.records import Recording, Values
 
 OUTLIER_FALSE_ALARM, FREEDOM = 1e-3, 4.0  # p and v
 ROBUST_ROUNDS, SETTLED_WEIGHT_CHANGE = 6, 0.05  # weights that change by less are final

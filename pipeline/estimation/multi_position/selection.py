@@ -37,10 +37,10 @@ from pipeline.physics.effects.base import Effect, Owner
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from pipeline.estimation.multi_position.model import Equations
-    from pipeline.estimation.rest_means import Rests
     from pipeline.core.records import Mask, Noise, SensorCalibration, Values
     from pipeline.core.settings import DataSheet
+    from pipeline.estimation.multi_position.model import Equations
+    from pipeline.estimation.rest_means import Rests
 
 
 MAX_SELECTION_ROUNDS = 3 * MAX_SELECTED_EFFECTS

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.records import BASE_COUNT
 from pipeline.estimation.multi_position.model import EquationBlock, effect_readings, motion_of
 from pipeline.estimation.rest_means import Rests, nearest_to_reference
-from pipeline.core.records import BASE_COUNT
 
 if TYPE_CHECKING:
+    from pipeline.core.records import Index, Values
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.model import State
-    from pipeline.core.records import Index, Values
 
 
 @dataclass(frozen=True)

@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
+from pipeline.core.records import AXES
 from pipeline.estimation.multi_position.moves import sound_span, spans_between
 from pipeline.estimation.rest_means import ROLE
-from pipeline.core.records import AXES
 from pipeline.physics.signal.segments import MAX_AXIS_SINE, SCALE, multiples
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.rest_means import Rests
     from pipeline.core.records import Index, Recording, Values
     from pipeline.core.settings import HandTurns, Procedure
+    from pipeline.estimation.rest_means import Rests
 
 BEGUN_DEG = 2.0  # as ``TURN_LIMIT_DEG`` of a rest: a larger turn before the first rest of a recording is motion
 

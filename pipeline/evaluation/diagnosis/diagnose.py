@@ -11,6 +11,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.errors import ConvergenceError, NotObservableError
+from pipeline.core.records import MATRIX, Noise, Recording, SensorCalibration, SensorDiagnosis, SensorValidation
+from pipeline.core.settings import Uncertainty
+from pipeline.core.verdicts import Verdict
+from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
+from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
+from pipeline.estimation.free_curves import OTHER_PREFIX
+from pipeline.estimation.noise import with_noises
+from pipeline.estimation.rest_means import is_multi_position
+from pipeline.estimation.stages import last_fit
 from pipeline.evaluation.diagnosis import multi_position, turntable
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, diagnosis_of
 from pipeline.evaluation.diagnosis.possible import without_impossible
@@ -22,20 +32,10 @@ from pipeline.evaluation.diagnosis.verdict import (
     judged,
     may_be_unknown,
 )
-from pipeline.core.errors import ConvergenceError, NotObservableError
-from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
-from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
-from pipeline.estimation.free_curves import OTHER_PREFIX
-from pipeline.estimation.noise import with_noises
-from pipeline.estimation.rest_means import is_multi_position
-from pipeline.estimation.stages import last_fit
-from pipeline.physics.calibration_file import not_determined
-from pipeline.physics.effects import catalogue, effect
-from pipeline.core.records import MATRIX, Noise, Recording, SensorCalibration, SensorDiagnosis, SensorValidation
-from pipeline.core.settings import Uncertainty
 from pipeline.evaluation.held_out.heldout import last_error, static_error
 from pipeline.evaluation.held_out.samples import HeldOutCase
-from pipeline.core.verdicts import Verdict
+from pipeline.physics.calibration_file import not_determined
+from pipeline.physics.effects import catalogue, effect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.physics.effects import effect_of
-from pipeline.physics.effects.base import truth, unit_of
-from pipeline.physics.measurement import linear_truth
 from pipeline.core.records import FittedEffect, Noise, Recording, SensorCalibration, SensorDiagnosis, Values
 from pipeline.evaluation.held_out.error_breakdown import last_step
 from pipeline.evaluation.held_out.samples import Samples, samples_of_motion
+from pipeline.physics.effects import effect_of
+from pipeline.physics.effects.base import truth, unit_of
+from pipeline.physics.measurement import linear_truth
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -13,23 +13,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.evaluation.diagnosis.verdict import if_observable
-from pipeline.evaluation.diagnosis.words import experiment_of, listed, of_unknown, plain, to_distinguish
+from pipeline.core.records import Answer, Candidate, Estimate, SensorDiagnosis, Wander, standard_uncertainty
+from pipeline.core.verdicts import Verdict
 from pipeline.estimation.design import EffectColumns, placed
 from pipeline.estimation.free_curves import OTHER_PREFIX
 from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
+from pipeline.evaluation.diagnosis.verdict import if_observable
+from pipeline.evaluation.diagnosis.words import experiment_of, listed, of_unknown, plain, to_distinguish
 from pipeline.physics.effects import catalogue, effect
-from pipeline.core.records import Answer, Candidate, Estimate, SensorDiagnosis, Wander, standard_uncertainty
-from pipeline.core.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.gauss_markov import Setting
-    from pipeline.estimation.ranking import Score
     from pipeline.core.records import (
         Dependence,
         MethodError,
@@ -40,6 +38,8 @@ if TYPE_CHECKING:
         Values,
     )
     from pipeline.core.settings import DataSheet, Settings
+    from pipeline.estimation.gauss_markov import Setting
+    from pipeline.estimation.ranking import Score
 
 LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings
 

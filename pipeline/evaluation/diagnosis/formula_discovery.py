@@ -1,7 +1,7 @@
 """Search for a formula of physics outside the catalogue, and write it as an effect file.
 
-Every form of the grammar (``pipeline.evaluation.diagnosis.functional_forms``) is scored as an effect would be: base and effects
-are projected out, and the noise is that of the engine. On the a axes that it improves, its score is
+Every form of the grammar (``pipeline.evaluation.diagnosis.functional_forms``) is scored as an effect would be: base and
+effects are projected out, and the noise is that of the engine. On the a axes that it improves, its score is
 
     2 (max log L' - max log L) - (r a + s) log N - 2 C log 10
 
@@ -28,26 +28,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.evaluation.diagnosis import functional_forms as forms
-from pipeline.evaluation.diagnosis.functional_forms import Form, Span
-from pipeline.evaluation.diagnosis.residual_dependence import dependences
-from pipeline.evaluation.diagnosis.residual_regression import FormGain, ProjectedCurves, Scan
-from pipeline.evaluation.diagnosis.words import listed
+from pipeline.core.records import Dependence, FittedForm, RankedFormula
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gates import MAX_MIN_DELTA_BIC, MIN_DELTA_BIC
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import without_each_recording, without_rows
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
+from pipeline.evaluation.diagnosis import functional_forms as forms
+from pipeline.evaluation.diagnosis.functional_forms import Form, Span
+from pipeline.evaluation.diagnosis.residual_dependence import dependences
+from pipeline.evaluation.diagnosis.residual_regression import FormGain, ProjectedCurves, Scan
+from pipeline.evaluation.diagnosis.words import listed
 from pipeline.physics.effects import catalogue, effect_from, forget, register
 from pipeline.physics.effects.base import unit_of
 from pipeline.physics.formula import SIGNALS, parse
-from pipeline.core.records import Dependence, FittedForm, RankedFormula
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
 
-    from pipeline.evaluation.diagnosis.findings import DiagnosisInput
     from pipeline.core.records import Values
+    from pipeline.evaluation.diagnosis.findings import DiagnosisInput
 
 PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
 # least delta BIC of a further term over that of the first: less may be rounding of the first's constants

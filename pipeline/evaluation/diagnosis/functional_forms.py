@@ -18,17 +18,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.evaluation.diagnosis.words import listed
 from pipeline.estimation.free_curves import CURVE_DEGREE
+from pipeline.evaluation.diagnosis.words import listed
 from pipeline.physics.effects.base import truth, unit_of
 from pipeline.physics.formula import parse
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from pipeline.evaluation.diagnosis.residual_regression import Curves
-    from pipeline.estimation.observations import Observations
     from pipeline.core.records import Motion, Values
+    from pipeline.estimation.observations import Observations
+    from pipeline.evaluation.diagnosis.residual_regression import Curves
 
 CYCLES = range(1, 13)
 POWERS = range(1, 6)

@@ -16,21 +16,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.records import BASE_COUNT
 from pipeline.estimation.design import Design, EffectColumns, placed
 from pipeline.estimation.gates import min_delta_bic
 from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import JointFit, design_at
 from pipeline.estimation.observations import without_each_recording
 from pipeline.estimation.ranking import projection, without
-from pipeline.core.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.observations import Observations
-    from pipeline.estimation.selection import Selection
     from pipeline.core.files import JSON
     from pipeline.core.records import Index, Values
+    from pipeline.estimation.observations import Observations
+    from pipeline.estimation.selection import Selection
 
 
 MOST_OF = 0.5  # share of the gain that the listed seconds have together

@@ -21,15 +21,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from pipeline.evaluation.diagnosis import functional_forms as forms
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
-from pipeline.evaluation.diagnosis.method_errors import given_differences
-from pipeline.evaluation.diagnosis.observability import MORE_RESTS, never_shown, not_observable_by_hand
-from pipeline.evaluation.diagnosis.residual_dependence import significant
-from pipeline.evaluation.diagnosis.residual_plots import added_variable_of_rests
-from pipeline.evaluation.diagnosis.verdict import verdict_of_selection_by_hand
-from pipeline.evaluation.diagnosis.words import listed, plain
 from pipeline.core.errors import CannotCalibrateError, NotObservableError, PipelineError
+from pipeline.core.records import Dependence, UnitRecordings
+from pipeline.core.verdicts import Verdict
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
@@ -42,16 +36,22 @@ from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import SelectionByHand, posterior
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import is_given
+from pipeline.evaluation.diagnosis import functional_forms as forms
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
+from pipeline.evaluation.diagnosis.method_errors import given_differences
+from pipeline.evaluation.diagnosis.observability import MORE_RESTS, never_shown, not_observable_by_hand
+from pipeline.evaluation.diagnosis.residual_dependence import significant
+from pipeline.evaluation.diagnosis.residual_plots import added_variable_of_rests
+from pipeline.evaluation.diagnosis.verdict import verdict_of_selection_by_hand
+from pipeline.evaluation.diagnosis.words import listed, plain
 from pipeline.physics.effects import catalogue, effect_from
-from pipeline.core.records import Dependence, UnitRecordings
-from pipeline.core.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.multi_position.model import Equations, Model, State
     from pipeline.core.records import Mask, Noise, Recording, SensorCalibration
     from pipeline.core.settings import Settings
+    from pipeline.estimation.multi_position.model import Equations, Model, State
 
 NEEDED_RECORDING = MORE_RESTS
 WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"

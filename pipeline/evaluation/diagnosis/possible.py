@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.evaluation.diagnosis.words import plain
+from pipeline.core.verdicts import Verdict
 from pipeline.estimation.gates import TIMES_POSSIBLE, possible
+from pipeline.evaluation.diagnosis.words import plain
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import parameter_limits
 from pipeline.physics.kinematics import EARTH_RATE_DPS
-from pipeline.core.verdicts import Verdict
 
 if TYPE_CHECKING:
-    from pipeline.evaluation.diagnosis.findings import DiagnosisInput
     from pipeline.core.records import Candidate, Recording, SensorDiagnosis
+    from pipeline.evaluation.diagnosis.findings import DiagnosisInput
 
 EARTH = "earth_rotation"
 OTHER_FILE = "check that the sensor's file is that of this unit, and that its range and units are right"

@@ -28,19 +28,19 @@ import numpy as np
 import scipy
 from numpy.polynomial.chebyshev import chebvander
 
-from pipeline.evaluation.diagnosis.functional_forms import Span, available_signals, signals_of
-from pipeline.evaluation.diagnosis.residual_regression import Curves, ProjectedCurves, Scan, each_explains
+from pipeline.core.records import Dependence
 from pipeline.estimation.free_curves import CURVE_DEGREE, MAX_CURVE_CYCLES
 from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import GaussMarkov, selection_grid
+from pipeline.evaluation.diagnosis.functional_forms import Span, available_signals, signals_of
+from pipeline.evaluation.diagnosis.residual_regression import Curves, ProjectedCurves, Scan, each_explains
 from pipeline.physics.effects import effect
-from pipeline.core.records import Dependence
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from pipeline.estimation.selection import Selection
     from pipeline.core.records import Index, Motion, Values
+    from pipeline.estimation.selection import Selection
 
     Block = tuple[Sequence[int], int]  # curves that are tried together: the first so many of them, and each further one
     Basis = tuple[str, Callable[[Motion], Values], list[Block]]  # covariate, its curves by motion: (n, q), and blocks

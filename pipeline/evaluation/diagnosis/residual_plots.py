@@ -21,22 +21,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.evaluation.diagnosis.functional_forms import columns_of, signals_of
+from pipeline.core.records import BASE_COUNT
 from pipeline.estimation.design import EffectColumns, placed
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Blocks, Products, Setting
 from pipeline.estimation.multi_position.fit import solve
 from pipeline.estimation.ranking import projection
+from pipeline.evaluation.diagnosis.functional_forms import columns_of, signals_of
 from pipeline.physics.effects.base import Layout, truth, unit_of
 from pipeline.physics.formula import parse
-from pipeline.core.records import BASE_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.multi_position import selection as by_hand
-    from pipeline.estimation.selection import Selection
     from pipeline.core.files import JSON
     from pipeline.core.records import Dependence, Index, Noise, Values
+    from pipeline.estimation.multi_position import selection as by_hand
+    from pipeline.estimation.selection import Selection
 
 
 OWN_BASE_COLUMNS = 4  # columns of the base on each axis

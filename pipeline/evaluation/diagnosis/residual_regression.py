@@ -29,8 +29,8 @@ from pipeline.estimation.ranking import MIN_LEFT_SQUARE_SHARE, MIN_NEW_COLUMN_SH
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from pipeline.estimation.selection import Selection
     from pipeline.core.records import Index, Mask, Motion, Values
+    from pipeline.estimation.selection import Selection
 
 Curves: TypeAlias = "Callable[[Motion], Values]"  # to (n, 1, q), or (n, 3, q) if they differ between the axes
 

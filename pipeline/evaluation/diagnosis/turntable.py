@@ -11,6 +11,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.errors import ConvergenceError
+from pipeline.core.records import Noise, SelectionErrors, SensorCalibration, TableEvidence
+from pipeline.core.verdicts import Verdict
+from pipeline.estimation.candidates import turns_of
+from pipeline.estimation.free_curves import free_curves
+from pipeline.estimation.generalized_least_squares import JointFit, calibration_of, fit_in_mean_frame, fit_terms
+from pipeline.estimation.observations import observe
+from pipeline.estimation.posterior_turns import posterior
+from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, why_not_suggested
 from pipeline.evaluation.diagnosis.influence import influence
@@ -20,19 +29,10 @@ from pipeline.evaluation.diagnosis.residual_dependence import dependences, goodn
 from pipeline.evaluation.diagnosis.residual_plots import plots
 from pipeline.evaluation.diagnosis.verdict import verdict_of_selection
 from pipeline.evaluation.diagnosis.words import FAR_OFF, plain
-from pipeline.core.errors import ConvergenceError
-from pipeline.estimation.candidates import turns_of
-from pipeline.estimation.free_curves import free_curves
-from pipeline.estimation.generalized_least_squares import JointFit, calibration_of, fit_in_mean_frame, fit_terms
-from pipeline.estimation.observations import observe
-from pipeline.estimation.posterior_turns import posterior
-from pipeline.estimation.selection import FAR_ABOVE, Selection, select
-from pipeline.physics.effects import catalogue, effect
-from pipeline.core.records import Noise, SelectionErrors, SensorCalibration, TableEvidence
 from pipeline.evaluation.held_out.error_breakdown import with_known_effects
 from pipeline.evaluation.held_out.heldout import noise_floors
 from pipeline.evaluation.held_out.samples import samples_of_motion
-from pipeline.core.verdicts import Verdict
+from pipeline.physics.effects import catalogue, effect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -1,7 +1,8 @@
 """Decide the verdict on one sensor, from the result of its selection and the error on held-out motion.
 
 The first rule of ``RULES`` that applies decides; if none applies, the verdict is that of the selection. A held-out
-error is compared with its 99 % interval (``pipeline.evaluation.held_out.expected_error``). Without an interval it has no effect.
+error is compared with its 99 % interval (``pipeline.evaluation.held_out.expected_error``). Without an interval it has
+no effect.
 """
 
 from __future__ import annotations
@@ -9,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from pipeline.evaluation.diagnosis.words import of_unknown, template
-from pipeline.estimation.stages import FitStage
-from pipeline.physics.effects.base import unit_of
 from pipeline.core.verdicts import Verdict
+from pipeline.estimation.stages import FitStage
+from pipeline.evaluation.diagnosis.words import of_unknown, template
+from pipeline.physics.effects.base import unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -81,7 +82,9 @@ class VerdictInput:
     agreement: Agreement | None = None
     static: HeldOutError | None = None  # mean of the static recording, by the unit's calibration
     doubts: Sequence[str] = ()  # contradictions of the reference, from the checks of the recordings
-    approximations: Sequence[str] = ()  # errors of the method's bias and matrix (``pipeline.evaluation.diagnosis.method_errors``)
+    approximations: Sequence[
+        str
+    ] = ()  # errors of the method's bias and matrix (``pipeline.evaluation.diagnosis.method_errors``)
     unknown: Sequence[str] = ()  # covariates on which the residual with the selected effects depends
     beyond: Sequence[str] = ()  # covariates of physics that is likely and outside the catalogue
     implausible: Sequence[str] = ()  # selected effects beyond the sensor's limits, unless the settings accept that

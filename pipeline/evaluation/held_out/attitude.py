@@ -22,6 +22,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import InputError
+from pipeline.core.records import (
+    MATRIX,
+    Integers,
+    Noise,
+    Recording,
+    SensorCalibration,
+    Values,
+    continuous,
+    level_in_body,
+)
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.multi_position.faces_and_turns import turns_of
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
@@ -31,7 +41,6 @@ from pipeline.estimation.rest_means import HELD_OUT, ROLE, is_multi_position
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.physics.compensation import Compensation
 from pipeline.physics.effects import effect
-from pipeline.core.records import MATRIX, Integers, Noise, Recording, SensorCalibration, Values, continuous, level_in_body
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

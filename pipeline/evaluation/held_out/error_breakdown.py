@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.records import FittedEffect, Motion, SensorCalibration, StepErrors, Values, corrected
+from pipeline.evaluation.held_out.samples import OTHER_SENSOR, Samples
 from pipeline.physics.effects import effect_of
 from pipeline.physics.effects.base import truth
 from pipeline.physics.effects.mounting import SEPARATOR, Mounting
 from pipeline.physics.log_motion import LogEnd, fields_used, log_motion
 from pipeline.physics.measurement import SensorEffects, linear_truth, solve
-from pipeline.core.records import FittedEffect, Motion, SensorCalibration, StepErrors, Values, corrected
-from pipeline.evaluation.held_out.samples import OTHER_SENSOR, Samples
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,9 +11,9 @@ The error of the calibrated reading of held-out sample n is ``M w_n + M m_n + J_
 
 An error of local gravity or of the time base is the same in calibration and reference, and is left out.
 
-The squared error of the magnitude has the mean ``tr(W S)`` (``pipeline.evaluation.held_out.samples``). Its mean over samples is
-a quadratic form A in Gaussians w, m and d of covariance C. It is replaced by a shifted chi-square with the same
-cumulants (J. P. Imhof, Biometrika 48 (1961), 419-426, section 4):
+The squared error of the magnitude has the mean ``tr(W S)`` (``pipeline.evaluation.held_out.samples``). Its mean over
+samples is a quadratic form A in Gaussians w, m and d of covariance C. It is replaced by a shifted chi-square with the
+same cumulants (J. P. Imhof, Biometrika 48 (1961), 419-426, section 4):
 
     k_1 = tr Q,   k_2 = 2 tr Q^2,   k_3 = 8 tr Q^3,      Q = A C
 
@@ -39,13 +39,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.records import BASE_COUNT, BIAS, MATRIX_ROWS
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, STATED_WIDTH, block_covariance
 from pipeline.estimation.selection import INFLATED
 from pipeline.estimation.uncertainty_budget import DITHERED, covariance_without_reference
-from pipeline.physics.measurement import inverse_of
-from pipeline.core.records import BASE_COUNT, BIAS, MATRIX_ROWS
 from pipeline.evaluation.held_out.error_breakdown import last_step
 from pipeline.evaluation.held_out.samples import Samples, mean_squares, reference_vector
+from pipeline.physics.measurement import inverse_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

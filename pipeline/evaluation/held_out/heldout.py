@@ -10,8 +10,8 @@ resolution of the encoder, uncertainty of the creep at rest; not the uncertainty
 Where no attitude is logged, |t| is the reference's magnitude, and the calibrated reading gives the direction of t.
 
 A calibration is worse than the raw readings where its error is above its expected interval
-(``pipeline.evaluation.held_out.expected_error``) and a t-test confirms it. The test compares the mean squared error of each
-stretch of the recordings with that of the raw readings: B stretches, B - 1 degrees of freedom, and the probability
+(``pipeline.evaluation.held_out.expected_error``) and a t-test confirms it. The test compares the mean squared error of
+each stretch of the recordings with that of the raw readings: B stretches, B - 1 degrees of freedom, and the probability
 ``FALSE_REFUSALS``.
 
 A small error of the matrix does not show in the magnitude of a held-out error, because the noise of single samples
@@ -34,15 +34,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
-from pipeline.estimation import reference_least_squares
-from pipeline.estimation.accelerometer.nonlinear_least_squares import PARAMETER_NAMES
-from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
-from pipeline.estimation.rest_means import count_of_rests
-from pipeline.estimation.uncertainty_budget import covariance_without_reference
-from pipeline.ingest.quality_flags import STUCK
-from pipeline.physics.effects import bench_priors, effect_of
-from pipeline.physics.effects.base import unit_of
-from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.core.records import (
     AXES,
     MATRIX,
@@ -55,7 +46,11 @@ from pipeline.core.records import (
     UnitRecordings,
 )
 from pipeline.core.settings import Uncertainty
-from pipeline.physics.signal.rests import Rest
+from pipeline.estimation import reference_least_squares
+from pipeline.estimation.accelerometer.nonlinear_least_squares import PARAMETER_NAMES
+from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
+from pipeline.estimation.rest_means import count_of_rests
+from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.evaluation.held_out.error_breakdown import (
     direction_known,
     error_breakdown,
@@ -65,6 +60,11 @@ from pipeline.evaluation.held_out.error_breakdown import (
 )
 from pipeline.evaluation.held_out.expected_error import LinearizedSamples, expected_rms_error, linearized
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, reference_vector, squared_norm_errors
+from pipeline.ingest.quality_flags import STUCK
+from pipeline.physics.effects import bench_priors, effect_of
+from pipeline.physics.effects.base import unit_of
+from pipeline.physics.kinematics import EARTH_RATE_DPS
+from pipeline.physics.signal.rests import Rest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -13,8 +13,8 @@ and the functions of ``sensors.TEMPLATE_FUNCTIONS``. The name of the template wi
 and, by default, of its file. Formats are listed nowhere else.
 
 ``calibration.h`` has the effects as C expressions (``plan_of``). It performs the operations of
-``pipeline.physics.compensation`` for one sample, in the same order. Double precision without fused operations and without
-functions of the C library then gives the same last bit. Effects of only time and temperature (``steady``) are
+``pipeline.physics.compensation`` for one sample, in the same order. Double precision without fused operations and
+without functions of the C library then gives the same last bit. Effects of only time and temperature (``steady``) are
 subtracted once. Effects of the motion (``moving``) are subtracted by a fixed-point iteration if they depend on the
 calibrated reading of the same sensor, also through the other sensor (``circular_sensors``).
 """
@@ -34,6 +34,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from pipeline.core.compiled_templates import CompiledTemplates
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.files import JSON  # noqa: TC001  (pydantic reads the fields' types)
+from pipeline.core.records import SENSORS, FittedEffect, SensorCalibration
 from pipeline.output.exports.sensors import (
     TEMPLATE_FUNCTIONS,
     UNIT_FACTORS,
@@ -50,12 +52,10 @@ from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.physics.formula import c_number
 from pipeline.physics.log_motion import FIELDS_OF_SIGNALS
 from pipeline.physics.measurement import sensor_effects
-from pipeline.core.records import SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.core.files import JSON
     from pipeline.core.settings import Settings
 
 TEMPLATES = Path(__file__).parent / "templates"

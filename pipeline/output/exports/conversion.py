@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.files import JSON, json_text, write_atomically
+from pipeline.core.records import BIAS, MATRIX, SCHEMA_VERSION, SENSOR_UNITS, SENSORS, SensorCalibration
 from pipeline.output.exports import ExportedUnit, export, formats, text_of
 from pipeline.output.exports.reading import CALIBRATION, ImportedCalibration, counts_of, read_any
 from pipeline.output.exports.sensors import SI, UNIT_FACTORS, ExportedSensor, SensorFigures, before_use
-from pipeline.core.files import JSON, json_text, write_atomically
 from pipeline.physics.compensation import Compensation
 from pipeline.physics.effects import effect_of
 from pipeline.physics.measurement import sensor_effects
-from pipeline.core.records import BIAS, MATRIX, SCHEMA_VERSION, SENSOR_UNITS, SENSORS, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

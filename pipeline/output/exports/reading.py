@@ -1,8 +1,8 @@
 """Read a calibration from a file in one of the formats.
 
 The declaration of a template states under ``read_back`` how its file is read: the ``kind`` of text
-(``pipeline.output.exports.text_kinds``), and for each sensor ``where``, the path of a value that exists only if the file
-contains this sensor, and an expression for each quantity:
+(``pipeline.output.exports.text_kinds``), and for each sensor ``where``, the path of a value that exists only if the
+file contains this sensor, and an expression for each quantity:
 
     bias | bias_after_matrix | bias_polynomial,   matrix | K,   g_sensitivity, scale_factor_temperature, bias_deviation
 
@@ -24,21 +24,21 @@ from jinja2 import TemplateError
 
 from imu_logs.files import read_text
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError, shortened
+from pipeline.core.pack import is_published, read_published
+from pipeline.core.records import BASE_COUNT, BIAS, SENSORS, FittedEffect, SensorCalibration
+from pipeline.ingest.axis_maps import STRAIGHT, maps_of_log
 from pipeline.output.exports import formats
 from pipeline.output.exports.sensors import TEMPLATE_FUNCTIONS, UNIT_FACTORS
 from pipeline.output.exports.text_kinds import Expressions, Node, parsed
-from pipeline.ingest.axis_maps import STRAIGHT, maps_of_log
 from pipeline.physics.calibration_file import read_calibration, sensor_of
 from pipeline.physics.effects import effect
-from pipeline.core.pack import is_published, read_published
-from pipeline.core.records import BASE_COUNT, BIAS, SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.core.records import Values
     from pipeline.output.exports import Format
     from pipeline.output.exports.sensors import SensorFigures
-    from pipeline.core.records import Values
 
 CALIBRATION = "calibration.json"  # name of the format of ``calibrations/<unit>.json``
 # of a file to read; a calibration has some kilobytes, the parameters of a vehicle 100

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.output.outcome import all_well, beyond_limits_groups, command_of, counts_of, explain_command, ratio_words
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Values
+from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, problems, state_of
+from pipeline.output.outcome import all_well, beyond_limits_groups, command_of, counts_of, explain_command, ratio_words
 from pipeline.output.pages.chart import Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
 from pipeline.output.pages.fleet import parameter_table, wide
 from pipeline.output.pages.numbers import Scale, number, percent, plain, scale_of, unit_text
 from pipeline.output.pages.pages import script_data, template
 from pipeline.output.pages.parameters import SUMMARY_COLUMNS
-from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, problems, state_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence

@@ -19,22 +19,22 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
-from pipeline.physics.calibration_file import beyond_uncertainty, frame_words
-from pipeline.output.outcome import run_command
 from pipeline.core.records import AXES, SENSORS
+from pipeline.core.verdicts import KINDS, Verdict, error_of
+from pipeline.output.outcome import run_command
 from pipeline.output.pages.held_out_section import first_and_last_step
 from pipeline.output.pages.numbers import number, plain
 from pipeline.output.pages.pages import template
 from pipeline.output.pages.parameters import fitted_parameters, reading_errors
 from pipeline.output.pages.unit_page import files_read
-from pipeline.core.verdicts import KINDS, Verdict, error_of
+from pipeline.physics.calibration_file import beyond_uncertainty, frame_words
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from pipeline.core.files import JSON
-    from pipeline.output.pages.parameters import Parameter
     from pipeline.core.settings import Certificate, Settings
+    from pipeline.output.pages.parameters import Parameter
 
 STAMP = "NOT A CALIBRATION CERTIFICATE - incomplete: "
 ONLY_THIS_ITEM = "The results relate only to the item calibrated."

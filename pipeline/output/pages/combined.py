@@ -34,13 +34,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.estimation.engine import scaled_inverse
-from pipeline.estimation.lot_prior import MIN_SIBLINGS, LotPrior, Prediction, lot_priors, with_prior
-from pipeline.estimation.uncertainty_budget import NOISE_SOURCE, own_and_bench
-from pipeline.estimation.uncertainty_budget import combined as budget_of
-from pipeline.ingest.files import wrong_name
-from pipeline.physics.effects import owner_of
-from pipeline.physics.effects.base import Owner
 from pipeline.core.records import (
     BASE_COUNT,
     BIAS,
@@ -55,11 +48,18 @@ from pipeline.core.records import (
     files_of_readings,
     matrix_of,
 )
+from pipeline.core.verdicts import Verdict
+from pipeline.estimation.engine import scaled_inverse
+from pipeline.estimation.lot_prior import MIN_SIBLINGS, LotPrior, Prediction, lot_priors, with_prior
+from pipeline.estimation.uncertainty_budget import NOISE_SOURCE, own_and_bench
+from pipeline.estimation.uncertainty_budget import combined as budget_of
+from pipeline.ingest.files import wrong_name
 from pipeline.output.pages.numbers import number, plain
 from pipeline.output.pages.pages import template
 from pipeline.output.pages.parameters import fitted_parameters
 from pipeline.output.pages.run_section import MARK
-from pipeline.core.verdicts import Verdict
+from pipeline.physics.effects import owner_of
+from pipeline.physics.effects.base import Owner
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

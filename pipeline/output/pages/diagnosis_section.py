@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import shortened
+from pipeline.core.records import AXES, SENSOR_UNITS, Values
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW, min_delta_bic
 from pipeline.estimation.posterior import prior_limit
-from pipeline.physics.effects import catalogue
-from pipeline.physics.effects.base import largest_by_unit, parameter_limits
-from pipeline.core.records import AXES, SENSOR_UNITS, Values
 from pipeline.output.pages.chart import ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
 from pipeline.output.pages.group_charts import Point, bars
 from pipeline.output.pages.numbers import measured, number, percent, plain, unit_text
+from pipeline.physics.effects import catalogue
+from pipeline.physics.effects.base import largest_by_unit, parameter_limits
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Noise, Recording, SensorCalibration, Values
+from pipeline.evaluation.held_out.error_breakdown import with_known_effects
+from pipeline.evaluation.held_out.samples import OTHER_SENSOR, samples_of_motion
 from pipeline.output.pages.chart import Area, ChartLayer, Figure, LineMark, Panel, SampleMarks, chart, sentences
 from pipeline.output.pages.group_charts import Point, bars
 from pipeline.output.pages.numbers import number, plain
-from pipeline.evaluation.held_out.error_breakdown import with_known_effects
-from pipeline.evaluation.held_out.samples import OTHER_SENSOR, samples_of_motion
 
 if TYPE_CHECKING:
     from pipeline.core.files import JSON
-    from pipeline.output.pages.numbers import Scale
     from pipeline.core.settings import Table
+    from pipeline.output.pages.numbers import Scale
 
 # held-out errors of diagnosis and validation that agree within this factor are shown as one series
 EQUAL_ERROR_FACTOR = 1.2

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.records import AXES, SENSOR_UNITS
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S
 from pipeline.estimation.noise_terms import TERM_UNITS, allan_variance
-from pipeline.core.records import AXES, SENSOR_UNITS
 from pipeline.output.pages.chart import AXES_LEGEND, Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
 from pipeline.output.pages.numbers import number, percent, plain
 

@@ -14,10 +14,10 @@ from jinja2 import Environment, FileSystemLoader, Template, select_autoescape
 from markupsafe import Markup
 
 from pipeline.core.compiled_templates import CompiledTemplates
+from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import is_fixed
 from pipeline.output.pages import numbers
 from pipeline.output.pages.numbers import Scale, measured, number, plain, unit_text
-from pipeline.core.verdicts import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping

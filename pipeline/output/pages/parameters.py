@@ -20,9 +20,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.estimation.candidates import is_fixed
-from pipeline.physics.calibration_file import beyond_uncertainty, left_out, limited_effects, without_rotation
-from pipeline.physics.open_effects import both_figures
 from pipeline.core.records import (
     AFTER_BASE,
     AXES,
@@ -34,9 +31,12 @@ from pipeline.core.records import (
     SENSORS,
     standard_uncertainty,
 )
+from pipeline.core.verdicts import Verdict, error_of
+from pipeline.estimation.candidates import is_fixed
 from pipeline.output.pages.held_out_section import first_and_last_step, passes
 from pipeline.output.pages.numbers import plain
-from pipeline.core.verdicts import Verdict, error_of
+from pipeline.physics.calibration_file import beyond_uncertainty, left_out, limited_effects, without_rotation
+from pipeline.physics.open_effects import both_figures
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -21,9 +21,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.physics.kinematics import table_motion
-from pipeline.physics.measurement import predicted_reading
-from pipeline.core.records import AXES, MEDIAN_SIZE, SENSOR_UNITS, Integers, Motion, Recording, SensorCalibration, Values
+from pipeline.core.records import (
+    AXES,
+    MEDIAN_SIZE,
+    SENSOR_UNITS,
+    Integers,
+    Motion,
+    Recording,
+    SensorCalibration,
+    Values,
+)
 from pipeline.output.pages.chart import (
     AXES_LEGEND,
     Area,
@@ -38,6 +45,8 @@ from pipeline.output.pages.chart import (
 )
 from pipeline.output.pages.group_charts import stems
 from pipeline.output.pages.numbers import number
+from pipeline.physics.kinematics import table_motion
+from pipeline.physics.measurement import predicted_reading
 from pipeline.physics.signal.encoder_rate import rate_by_angle
 from pipeline.physics.signal.filters import filtered
 

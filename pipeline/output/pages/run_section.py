@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.core.records import SENSOR_UNITS, SENSORS
 from pipeline.output.history import difference, dropped, of_units
 from pipeline.output.outcome import add_command, uncertainty_words
-from pipeline.core.records import SENSOR_UNITS, SENSORS
 from pipeline.output.pages.chart import Figure
 from pipeline.output.pages.group_charts import Point, bars
 from pipeline.output.pages.numbers import number, plain

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.files import JSON, json_text
-from pipeline.physics.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
-from pipeline.output.outcome import apply_command, as_overrides, commands_of, found_mountings, place, run_command
 from pipeline.core.records import AXES, BIAS, MATRIX, SENSOR_UNITS, SENSORS, Recording, Values
+from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, css_class, error_of, kinds_of
+from pipeline.output.outcome import apply_command, as_overrides, commands_of, found_mountings, place, run_command
 from pipeline.output.pages.chart import ChartLayer, Figure, LineMark, Panel, chart
 from pipeline.output.pages.diagnosis_section import (
     added_variable,
@@ -35,8 +35,8 @@ from pipeline.output.pages.numbers import NOTHING, measured_row, number, scale_o
 from pipeline.output.pages.pages import template
 from pipeline.output.pages.parameters import fitted_parameters, parameter_rows, summary_row
 from pipeline.output.pages.residual_section import measurement_and_model, residual_figures, residuals
+from pipeline.physics.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 from pipeline.physics.signal.rests import Rest, rests_from_table
-from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, css_class, error_of, kinds_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -21,10 +21,10 @@ from math import inf
 from typing import TYPE_CHECKING, Any
 
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.records import AXES, SENSORS
 from pipeline.physics.checked import Check, WrongValueError, each, expected, fields, flag, items, one_of, text
 from pipeline.physics.effects.base import EffectParameter, Owner
 from pipeline.physics.formula import SIGNALS, Formula, parse
-from pipeline.core.records import AXES, SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import InputError
+from pipeline.core.records import AXES, Motion, Values
 from pipeline.physics.effects.base import Effect, EffectParameter, Layout, length, per_axis, truth, turning_direction
 from pipeline.physics.formula import OF_THE_MOTION, SIGNALS, c_number
-from pipeline.core.records import AXES, Motion, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

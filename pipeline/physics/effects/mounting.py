@@ -37,10 +37,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.records import MATRIX
 from pipeline.physics.effects.base import Effect, EffectParameter, Layout, Owner, truth, unit_of
 from pipeline.physics.effects.formula_effect import DeclaredEffect
 from pipeline.physics.kinematics import skew, turn_by_vector
-from pipeline.core.records import MATRIX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

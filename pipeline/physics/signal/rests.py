@@ -12,10 +12,10 @@ where
           variance of rounding, by the smallest step between successive readings
     m   : the multiple, from the widest range over which the number of rests stays the same
 
-A rest is trimmed by W at its start. A gyroscope must be quiet, too (``pipeline.physics.signal.quiet_motion``), as a turn about
-the vertical does not change the specific force. A rest is refused if its angular rate differs from that of the
-neighbouring rests, the direction of the specific force moves, or the readings scatter more than noise. A turn by theta
-shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
+A rest is trimmed by W at its start. A gyroscope must be quiet, too (``pipeline.physics.signal.quiet_motion``), as a
+turn about the vertical does not change the specific force. A rest is refused if its angular rate differs from that of
+the neighbouring rests, the direction of the specific force moves, or the readings scatter more than noise. A turn by
+theta shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ VARIANCE_MULTIPLES = np.geomspace(4.0, 1000.0, 25)  # of a variance: 2 to 30 tim
 MIN_NOISE_VARIANCE_G2 = 1e-12  # g^2, keeps the multiple of a noise-free recording above rounding
 NEIGHBOUR_RESTS = 5  # rests: their median is robust against two that turned
 TURN_LIMIT_DEG = 2.0  # 0.05 mg, see above
-# A steady tilt is modelled up to this rate (``pipeline.physics.signal.quiet_motion``); units in a hand or on a soft support
-# creep by up to 0.3 deg/s.
+# A steady tilt is modelled up to this rate (``pipeline.physics.signal.quiet_motion``); units in a hand or on a soft
+# support creep by up to 0.3 deg/s.
 CREEP_LIMIT_DPS, STEADY_LIMIT_DEG = 0.5, 10.0
 SCATTER_LIMIT = 3.0  # times the noise; noise alone stays below 1.3 in the 100 samples of a rest at 100 Hz
 SMALLEST_SCATTER_G2 = 3e-6  # 1 mg on each axis, so that a quiet sensor may settle by 0.1 deg

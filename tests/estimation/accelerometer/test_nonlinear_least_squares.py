@@ -12,7 +12,10 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 from unit_settings import settings_of, with_noise
 
+from pipeline.app.planning.guide import derivative_of
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
+from pipeline.core.records import Recording, SensorCalibration, StageResult, coverage_factor
+from pipeline.core.records.correction import corrected
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit, triangle
 from pipeline.estimation.gauss_markov import WanderPrior
 from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
@@ -21,9 +24,6 @@ from pipeline.estimation.multi_position.fit import fit as fit_model
 from pipeline.estimation.multi_position.model import State, prior_hypotheses
 from pipeline.estimation.rest_means import gathered, held_out_rests, rest_means
 from pipeline.physics.calibration_file import not_determined
-from pipeline.app.planning.guide import derivative_of
-from pipeline.core.records import Recording, SensorCalibration, StageResult, coverage_factor
-from pipeline.core.records.correction import corrected
 from pipeline.physics.signal.rests import Rest
 
 if TYPE_CHECKING:

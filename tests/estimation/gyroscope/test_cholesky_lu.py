@@ -9,10 +9,10 @@ import pytest
 from unit_settings import settings_of, with_noise
 
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError, NotObservableError
-from pipeline.estimation.gyroscope.cholesky_lu import factorise, fit
-from pipeline.estimation.stages import fit_stage
 from pipeline.core.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
 from pipeline.core.records.correction import corrected
+from pipeline.estimation.gyroscope.cholesky_lu import factorise, fit
+from pipeline.estimation.stages import fit_stage
 
 if TYPE_CHECKING:
     from pipeline.core.settings import Settings

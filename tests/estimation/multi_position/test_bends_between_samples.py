@@ -7,9 +7,9 @@ import pytest
 from hand_session import hand_held
 from unit_settings import settings_of
 
+from pipeline.core.records import Recording
 from pipeline.estimation.multi_position.moves import moves_of
 from pipeline.estimation.rest_means import rests_of
-from pipeline.core.records import Recording
 
 INTERVAL_S, RATE_DPS, RAMP_S, MOVE_S, PERIOD_S = 0.12, 60.0, 0.3, 2.0, 8.0
 NOISE_DPS = 1e-4

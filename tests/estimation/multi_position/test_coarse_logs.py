@@ -9,8 +9,8 @@ import pytest
 from ferraris_session import FITS
 from unit_settings import settings_of, with_noise
 
-from pipeline.estimation.stated_lines import with_stated
 from pipeline.core.records import BIAS, base_values
+from pipeline.estimation.stated_lines import with_stated
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from unit_settings import settings_of
 
+from pipeline.core.records import Recording, SensorCalibration
 from pipeline.estimation.multi_position.moves import clocks_of, gravity_of
 from pipeline.estimation.rest_means import rests_of
-from pipeline.core.records import Recording, SensorCalibration
 
 NOISE = 5e-4
 TICK = 0.00996  # s; rounded to ms, one step in 25 is 9 ms and the others 10 ms

@@ -17,9 +17,9 @@ from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, GyroscopeMod
 from pipeline.estimation.multi_position.model import NoiseHypothesis, State
 from pipeline.estimation.noise import estimate_noise, noise_of
 from pipeline.estimation.stages import fit_stage, last_fit
+from pipeline.evaluation.held_out.attitude import gravity_direction
 from pipeline.physics.signal.rests import find_rests
 from pipeline.physics.signal.segments import multiples, turns_by_hand
-from pipeline.evaluation.held_out.attitude import gravity_direction
 from tests.published import diagnose
 
 FACE = np.radians(PROCEDURE.faces.accuracy_deg)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import pipeline
-from pipeline.core.errors import InputError
 from pipeline.app.field_logs.compensate import compensate_log
-from pipeline.physics.compensation import load
+from pipeline.core.errors import InputError
 from pipeline.core.records import SensorCalibration
+from pipeline.physics.compensation import load
 from tests.study.listed_recordings import Unit, at_rest, joined, turned
 
 if TYPE_CHECKING:

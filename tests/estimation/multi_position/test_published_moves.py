@@ -14,10 +14,10 @@ from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.rest_means import split_rests
+from pipeline.evaluation.held_out.attitude import gravity_direction
 from pipeline.ingest.read import read_recordings
 from pipeline.physics.measurement import compensate
 from pipeline.simulation.description import shipped_settings
-from pipeline.evaluation.held_out.attitude import gravity_direction
 
 if TYPE_CHECKING:
     from pipeline.core.records import Recording, SensorCalibration

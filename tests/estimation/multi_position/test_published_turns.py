@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from unit_settings import settings_of, with_noise
 
+from pipeline.core.settings import Window
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.ingest.read import read_recordings
-from pipeline.core.settings import Window
 from pipeline.physics.signal.segments import cut
 from pipeline.simulation.description import shipped_settings
 
