@@ -29,7 +29,7 @@ from pipeline.checks.reference import check_motion, check_turns
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Note
 from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.physics.kinematics import normal_gravity_g
-from pipeline.physics.signal.quiet_motion import coarse_steps
+from pipeline.physics.signal.quiet_motion import coarse_of, rounding_of, step_and_noise
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -76,7 +76,8 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
     noted = list(recordings)
     for sensor in SENSORS:
         own = [k for k, r in enumerate(recordings) if r.reading(sensor) is not None]
-        steps = coarse_steps([np.asarray(recordings[k].reading(sensor)) for k in own])
+        found = [step_and_noise(np.asarray(recordings[k].reading(sensor))) for k in own]
+        steps, rounding = coarse_of(found), np.sqrt(3.0) * rounding_of(found)  # half-width of a rectangle
         for step in np.unique(steps[steps > 0.0]):
             axes = ", ".join(name for name, s in zip(TRIADS[sensor], steps, strict=True) if s == step)
             digits = next(
@@ -85,7 +86,7 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
             )
             detail = (
                 f"{axes}: steps of {step:.3g} {SENSOR_UNITS[sensor]}{digits} and noise of less than half a step: "
-                f"means are off by up to {0.5 * step:.3g} {SENSOR_UNITS[sensor]}, however long the recording, and "
+                f"means are off by up to {rounding[steps == step].max():.3g} {SENSOR_UNITS[sensor]}, however long the recording, and "
                 "effects of this size cannot be distinguished from rounding. Log more digits, or set a smaller range"
             )
             first = noted[own[0]]

@@ -170,11 +170,13 @@ def linear_convergence_evidence(A: Values, residual: Values, condition: float, r
     return convergence_evidence(float(cosine.max()), condition, rank, A.shape[1])
 
 
-def convergence_evidence(cosine: float, condition: float, rank: int, parameters: int) -> dict[str, Any]:
+def convergence_evidence(
+    cosine: float, condition: float, rank: int, parameters: int, *, at_minimum: float = COSINE_AT_MINIMUM
+) -> dict[str, Any]:
     """Return the evidence that a fit is at its minimum, for ``SensorCalibration.convergence``."""
     return {
         "cosine": cosine,
-        "cosine_at_minimum": COSINE_AT_MINIMUM,
+        "cosine_at_minimum": at_minimum,
         "condition": condition if np.isfinite(condition) else None,
         "rank": rank,
         "parameters": parameters,

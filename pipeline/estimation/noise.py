@@ -77,7 +77,13 @@ from pipeline.estimation.gauss_markov import (
     variance_of_average,
 )
 from pipeline.physics.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
-from pipeline.physics.signal.quiet_motion import coarse_steps, component_along_gravity, creep_of_readings
+from pipeline.physics.signal.quiet_motion import (
+    coarse_of,
+    component_along_gravity,
+    creep_of_readings,
+    rounding_of,
+    step_and_noise,
+)
 from pipeline.physics.signal.rests import rest_readings, stretches_of, usable
 
 if TYPE_CHECKING:
@@ -111,14 +117,15 @@ def estimate_noise(sensor: str, recordings: Sequence[Recording], data_sheet: Dat
 
 def _not_below_rounding(noise: Noise, sensor: str, recordings: Sequence[Recording], data_sheet: DataSheet) -> Noise:
     """Return the noise with at least the rounding error of coarse readings as white noise."""
-    steps = coarse_steps([values for r in recordings if (values := r.reading(sensor)) is not None])
+    shown = [step_and_noise(values) for r in recordings if (values := r.reading(sensor)) is not None]
+    steps, rounding = coarse_of(shown), rounding_of(shown)
     constant = noise.white <= SMALLEST_WHITE
     if not np.any(constant | (steps > 0.0)):
         return noise
     stated = data_sheet.noise_density * np.sqrt(0.5 / recordings[0].interval)
-    white = np.maximum(np.where(constant, stated, noise.white), steps / np.sqrt(12.0))
+    white = np.maximum(np.where(constant, stated, noise.white), rounding)
     found = _with_stated_wander(white, data_sheet, "data_sheet" if constant.all() and stated else noise.source)
-    return replace(found, step=steps if np.any(steps > 0.0) else None)
+    return replace(found, step=steps, rounding=rounding) if np.any(steps > 0.0) else found
 
 
 def _of_recordings(sensor: str, fitted: list[Recording], data_sheet: DataSheet) -> Noise:

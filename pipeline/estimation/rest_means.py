@@ -19,7 +19,7 @@ from pipeline.estimation.turns import stop_and_go
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.physics.kinematics import table_motion
 from pipeline.physics.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
-from pipeline.physics.signal.quiet_motion import coarse_of, creep_of_rest, posterior_creep_rates, step_and_noise
+from pipeline.physics.signal.quiet_motion import rounding_of, creep_of_rest, posterior_creep_rates, step_and_noise
 from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, usable
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ class Rests:
     held_out: Mask  # (m,)
     soaked: Mask  # (m,); whether each is a part of a soak
     span: Index  # (m, 2); its first sample, and the one after its last
-    step: Values  # (m, 3), g or deg/s; of the readings on an axis whose noise is below half a step, else 0
+    rounding: Values  # (m, 3), g or deg/s; standard uncertainty by steps of the readings that hide their noise
     # (m, 3), deg/s; rate across gravity at which the unit tilts, by the readings of the accelerometer; 0 where it
     # stands still
     creep: Values
@@ -216,11 +216,11 @@ class Rests:
         return replace(self, **{name: values[index] for name, values in arrays.items()})
 
     def variance(self, white: Values) -> Values:
-        """Return the variance of each mean by white noise, (3,), of a sample and by coarse steps: (m, 3) array.
+        """Return the variance of each mean by white noise, (3,), of a sample and by rounding: (m, 3) array.
 
-        In steps d that hide the noise a mean has the rounding error ``d / sqrt(12)``, however many readings it has.
+        Readings in steps that hide their noise have a rounding error, however many a mean has.
         """
-        return np.asarray(self.share[:, None] * white**2 + self.step**2 / 12.0 + self.own[:, None])
+        return np.asarray(self.share[:, None] * white**2 + self.rounding**2 + self.own[:, None])
 
     @property
     def white(self) -> Values:
@@ -283,8 +283,8 @@ def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, 
     parts = {index: _of_recording(recordings[index], sensor, tuple(rests)) for index, rests in chosen.items()}
     columns = {name: np.concatenate([part[name] for part in parts.values()]) for name in next(iter(parts.values()))}
     columns["recording"] = np.repeat([*parts], [len(part["time"]) for part in parts.values()])
-    step = coarse_of([_step_and_noise(r, sensor) for r in recordings if r.reading(sensor) is not None])
-    columns["step"] = np.tile(step, (len(columns["time"]), 1))
+    rounding = rounding_of([_step_and_noise(r, sensor) for r in recordings if r.reading(sensor) is not None])
+    columns["rounding"] = np.tile(rounding, (len(columns["time"]), 1))
     shared = len(np.unique(columns["recording"])) == 1 or all(recordings[index].clock_shared for index in chosen)
     return Rests(**columns, clock_shared=shared, kinds=frozenset(recordings[index].kind for index in chosen))
 

@@ -109,14 +109,16 @@ def _rounding(
     if (
         noise is None
         or noise.step is None
+        or noise.rounding is None
         or by_moves
         or any(line.source == QUANTISATION_SOURCE for line in calibration.lines)
     ):
         return []
-    largest, unit = float(noise.step.max()), SENSOR_UNITS[calibration.sensor]
-    effect = np.eye(len(calibration.parameters))[:, BIAS] * noise.step / largest
-    remark = f"readings in steps of up to {largest:.3g} {unit} with less noise than half a step: log more digits"
-    return [type_b(QUANTISATION_SOURCE, RECTANGULAR, largest / np.sqrt(12.0), unit, effect, remark)]
+    largest, unit = float(noise.rounding.max()), SENSOR_UNITS[calibration.sensor]
+    effect = np.eye(len(calibration.parameters))[:, BIAS] * noise.rounding / largest
+    steps = f"steps of up to {float(noise.step.max()):.3g} {unit}"
+    remark = f"readings in {steps} with less noise than half a step: log more digits"
+    return [type_b(QUANTISATION_SOURCE, RECTANGULAR, largest, unit, effect, remark)]
 
 
 def _counted_time(

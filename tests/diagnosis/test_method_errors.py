@@ -58,7 +58,7 @@ def test_the_diagonal_matrix_of_the_staged_method_leaves_mounting_and_non_orthog
     E = calibration.matrix @ K["accelerometer"] - np.eye(3)
     found = by_name(part)
     assert part["verdict"] == "left_by_method"
-    assert "The error of a free fit of the same recordings is" in part["reason"]
+    assert "That of a free fit of the same recordings is" in part["reason"]
     assert "reference_least_squares" in part["next_experiment"]
     assert set(found) == {"rotation", "non_orthogonality"}
     assert found["rotation"]["size"] == pytest.approx(np.degrees(np.abs(E - E.T).max() / 2.0), rel=0.05)

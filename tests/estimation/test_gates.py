@@ -58,9 +58,10 @@ def test_an_effect_that_takes_the_place_of_another_passes_the_gate(
 
     hand = object.__new__(by_hand.SelectionByHand)
     vars(hand).update(common, names=["g_sensitivity"], model=SimpleNamespace(sensor="gyroscope"))
+    vars(hand).update(first=SimpleNamespace(scores=scores))
     monkeypatch.setattr(hand, "_without", lambda _: SimpleNamespace(scores=scores), raising=False)
     monkeypatch.setattr(hand, "_remove", lambda _: None, raising=False)
-    monkeypatch.setattr(hand, "_add", lambda score: taken.append(score.name), raising=False)
+    monkeypatch.setattr(hand, "_add", lambda score, _: taken.append(score.name), raising=False)
     assert hand._exchange() is exchanged
 
     table = object.__new__(Selection)

@@ -71,7 +71,7 @@ def test_what_is_not_stated_is_named_with_the_key_that_states_it(fitted: Any) ->
 def test_no_bias_of_a_coarse_log_is_better_than_its_rounding(fitted: Any) -> None:
     calibration, warm = fitted[0], fitted[1].filtered
     step = np.array([0.5, 0.0, 1.0])
-    noise = Noise(np.full(3, 0.3), np.zeros(3), 100.0, "static", step=step)
+    noise = Noise(np.full(3, 0.3), np.zeros(3), 100.0, "static", step=step, rounding=step / np.sqrt(12.0))
     found = with_stated(calibration, known(warm, noise), sheet())
     was, u = (np.sqrt(np.diag(c.covariance))[:3] for c in (calibration, found))
     assert u == pytest.approx(np.hypot(was, step / np.sqrt(12.0)))

@@ -78,7 +78,8 @@ def drawn(
             "zero_deg": dict.fromkeys(TURNS, float(rng.uniform(-180.0, 180.0))),
         }
     sensor = str(of_unit.choice(SENSORS))
-    names = [n for n, e in built_in().items() if sensor in e.sensors and sensor not in e.unseen and n not in NOT_HIDDEN]
+    possible = {n: e for n, e in built_in().items() if n not in NOT_HIDDEN and not e.shown_by}  # no table shows these
+    names = [n for n, e in possible.items() if sensor in e.sensors and sensor not in e.unseen]
     effect = str(of_unit.choice(names)) if of_unit.random() < hidden else ""
     table = "acutronic" if KINDS[kind] == "plain" else "single_axis"
     model = ("mpu6050", "stim300")[number % 2]

@@ -104,7 +104,7 @@ def test_validation_words_page_and_exports_know_it(bench: Bench, capsys: pytest.
     assert after["vector_rms_error"] < 0.2 * before["vector_rms_error"]
     assert explain.main([str(bench.results)]) == 0
     words = capsys.readouterr().out
-    assert "The model of the accelerometer misses loose part." in words
+    assert "effect missing: found; accelerometer: loose part" in words
     assert "A loose part of the sensor tips over with gravity." in words
     assert "loose_part" in (bench.results / "reports" / "known.html").read_text()
     header = (bench.results / "exports" / "known" / "calibration.h").read_text()

@@ -200,7 +200,8 @@ class Noise:
     turns about a local polynomial) or ``data_sheet`` (the sensor file). ``length`` is the duration, s, of the static
     rest, or of all rests by hand that show the wander, else 0; the relative uncertainty of the wander is about
     ``sqrt(correlation_time / length)``. ``likelihood`` is None without a static recording. ``step``: of the readings of
-    each axis, where it hides the noise (``pipeline.physics.signal.quiet_motion.coarse_steps``); else None.
+    each axis, where it hides the noise (``pipeline.physics.signal.quiet_motion.coarse_of``); else None. ``rounding``:
+    the standard uncertainty of means by these steps.
     """
 
     white: Values
@@ -211,7 +212,9 @@ class Noise:
     time_source: str = "data_sheet"
     length: float = 0.0
     likelihood: WanderLikelihood | None = None
-    step: Values | None = None  # (3,), 0 for an axis whose readings are finer than its noise
+    # each (3,), 0 for an axis whose readings are finer than its noise
+    step: Values | None = None
+    rounding: Values | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the noise as JSON values."""

@@ -228,27 +228,25 @@ def _fit_determined(rows: Orientations, gravity_g: float, prior: WanderPrior, li
             f"{count} orientations determine neither bias nor scale factors: {_unused(rows)}. Record rests in at "
             "least 6 orientations, each axis up and down, or better in 24 that are spread evenly"
         )
-    try:
-        solved = _fitted(rows, gravity_g, prior, dict.fromkeys(PARAMETER_NAMES[MISALIGNMENT].tolist(), limit))
-        # A variance of more than half that of the limit is mostly the limit's.
-        by_limit = MISALIGNMENT & ((solved.uncertainty > limit * np.sqrt(0.5)) | (count < len(PARAMETER_NAMES)))
-        if not np.array_equal(by_limit, MISALIGNMENT):
-            solved = _fitted(rows, gravity_g, prior, dict.fromkeys(PARAMETER_NAMES[by_limit].tolist(), limit))
-    except NotObservableError as lack:
-        raise NotObservableError(
-            f"the {count} orientations are too much alike: {lack.message} ({_unused(rows)}). Record rests "
-            "with each axis up, down and level, spread evenly"
-        ) from lack
-    u = solved.uncertainty
+    solved = _fitted(rows, gravity_g, prior, dict.fromkeys(PARAMETER_NAMES[MISALIGNMENT].tolist(), limit))
+    # A variance of more than half that of the limit is mostly the limit's.
+    by_limit = MISALIGNMENT & ((solved.uncertainty > limit * np.sqrt(0.5)) | (count < len(PARAMETER_NAMES)))
+    if not np.array_equal(by_limit, MISALIGNMENT):
+        solved = _fitted(rows, gravity_g, prior, dict.fromkeys(PARAMETER_NAMES[by_limit].tolist(), limit))
+    _require_known(solved.uncertainty, rows)
+    return solved
+
+
+def _require_known(u: Values, rows: Orientations) -> None:
+    """Raise ``NotObservableError`` if the standard uncertainty of a bias or scale factor, (9,), is too large."""
     weak = (u > MAX_KNOWN_UNCERTAINTY) & ~MISALIGNMENT
     if weak.any():
         raise NotObservableError(
-            f"the {count} orientations are nearly degenerate: they leave {', '.join(PARAMETER_NAMES[weak])} open to "
-            f"{float(u[weak].max()):.2g} (standard uncertainty; condition {solved.fit.condition:.1e} in scaled "
-            f"columns; {_unused(rows)}). Record rests with each axis up, down and level, spread evenly, not all in one "
-            "plane or direction"
+            f"the {len(rows.rests.time)} orientations are nearly degenerate: they leave "
+            f"{', '.join(PARAMETER_NAMES[weak])} open to {float(u[weak].max()):.2g} (standard uncertainty; "
+            f"{_unused(rows)}). Record rests with each axis up, down and level, spread evenly, not all in one plane or "
+            "direction"
         )
-    return solved
 
 
 def _fit_partly(rows: Orientations, gravity_g: float, prior: WanderPrior, data_sheet: DataSheet) -> _Solved:
@@ -257,7 +255,7 @@ def _fit_partly(rows: Orientations, gravity_g: float, prior: WanderPrior, data_s
         raise NotObservableError(f"no rest of the accelerometer was found: {_unused(rows)}")
 
     def solve_with(held: Mapping[str, float]) -> tuple[_Solved, Values]:
-        solved = _fitted(rows, gravity_g, prior, held)
+        solved = _fitted(rows, gravity_g, prior, held, partly=True)
         return solved, solved.uncertainty
 
     return with_limits(dict(zip(PARAMETERS, limits_of_parameters(data_sheet).tolist(), strict=True)), solve_with)
@@ -270,14 +268,28 @@ def _unused(rows: Orientations) -> str:
     return f"{left_out} rests were left out because the sensor moved, {held_out} are held out for validation{unless}"
 
 
-def _fitted(rows: Orientations, gravity_g: float, prior: WanderPrior, limits: Mapping[str, float]) -> _Solved:
-    """Fit the nine values; raise ``NotObservableError`` if orientations and limits do not determine them."""
+def _fitted(
+    rows: Orientations, gravity_g: float, prior: WanderPrior, limits: Mapping[str, float], *, partly: bool = False
+) -> _Solved:
+    """Fit the nine values; raise ``NotObservableError`` if orientations and limits do not determine them.
+
+    ``partly``: whether a bias or scale factor may be known to its limit alone.
+    """
     noise = Noise(rows.white, np.zeros(3), prior.time, "rests")
     model = AccelerometerModel(rows.rests, PLACED, gravity_g, noise, known_by_limit=limits, wander=rows.by_hand)
     values = _start(rows.rests.reading, gravity_g, tilted=not limits)
     state = State(values[BIAS], triangle(values))
     equations = model.equations(state)
-    ScaledColumns.of(equations.base).require_full_rank(PARAMETER_NAMES.tolist())
+    columns = ScaledColumns.of(equations.base)
+    try:
+        columns.require_full_rank(PARAMETER_NAMES.tolist())
+    except NotObservableError as lack:
+        raise NotObservableError(
+            f"the {len(rows.rests.time)} orientations are too much alike: {lack.message} ({_unused(rows)}). Record rests "
+            "with each axis up, down and level, spread evenly"
+        ) from lack
+    if not partly:  # far from a minimum that the orientations hardly determine, the fit would name others
+        _require_known(np.linalg.norm(columns.weights(), axis=1), rows)
     known = WanderPrior(0.0, prior.time) if not rows.by_hand else prior
     noises = prior_hypotheses(known, float(np.mean(model.white)), model.kinds)
     if known.wander == 0.0:  # on a table the wander follows from all readings

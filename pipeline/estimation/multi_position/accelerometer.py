@@ -8,8 +8,8 @@ where
     y   : (3,) mean reading of a rest, g; w s^2 its variance, s^2 that of a sample
     b, M: bias, g, and matrix ``M = Q L``: |f| determines the lower triangular L, but not the rotation Q, which is fixed
     z   : effects, at the force of the magnitude of gravity; p their parameters
-    s_e : standard deviation of |f|: ``s_e^2 = sum_c (M^T n)_c^2 (w s_c^2 + v + d_c^2 / 12)``, d coarse steps of
-          readings, v the variance of a mean that was recorded as such, whose w is 0
+    s_e : standard deviation of |f|: ``s_e^2 = sum_c (M^T n)_c^2 (w s_c^2 + v + r_c^2)``, r the rounding error of
+          coarse readings, v the variance of a mean that was recorded as such, whose w is 0
 
 If the procedure states faces, their equations are added (``faces_and_turns``), and the full matrix is fitted. Otherwise
 a misalignment that the rests do not determine is known by the sensor file's limit c of the cross-axis sensitivity:

@@ -101,6 +101,11 @@ class FitByHand:
         return self._every[1][self._likeliest].condition
 
     @property
+    def cosine_at_minimum(self) -> float:
+        """The cosine where each of p parameters is ``SMALL_LAST_STEP`` uncertainties off: times ``sqrt(p / n)``."""
+        return SMALL_LAST_STEP * float(np.sqrt(len(self.precision) / len(self.residual)))
+
+    @property
     def covariance(self) -> Values:
         """Of the base parameters along the model's directions, and of the effects': (b + p, b + p) array."""
         return self._averaged[0]

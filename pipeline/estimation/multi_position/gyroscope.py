@@ -238,10 +238,10 @@ class GyroscopeModel:
 
     def _of_rests(self, K: Values, error: Values) -> Values | None:
         """Return the covariance of the rests' equations by creep, and by rounding that all rests share: (3 m, 3 m)."""
-        across, about, step = self.rests.creep_error, self.rests.creep_about, self.rests.step
-        if not about.any() and not step.any():
+        across, about, r = self.rests.creep_error, self.rests.creep_about, self.rests.rounding
+        if not about.any() and not r.any():
             return None
-        rounding = np.einsum("ic,jd,cd->icjd", step / error, step / error, np.eye(3) / 12.0).reshape(error.size, -1)
+        rounding = np.einsum("ic,jd,cd->icjd", r / error, r / error, np.eye(3)).reshape(error.size, -1)
         u = self.force / np.linalg.norm(self.force, axis=1, keepdims=True)
         upward = u[:, :, None] * u[:, None, :]
         rate = across[:, None, None] ** 2 * (np.eye(3) - upward) + about[:, None, None] ** 2 * upward

@@ -351,8 +351,8 @@ def gravity_of(
         noise = np.where(creeps, np.maximum(noise, share), noise)
         creeping |= np.linalg.norm(near - u, axis=1) > SIGNIFICANT_OFFSET_DEVIATIONS * np.sqrt(share * white)
     between = [float(stage.details.get("scatter_between_rests") or 0.0) for stage in accelerometer.stages]
-    of_steps = rests.own + np.mean(rests.step**2, axis=1) / 12.0
-    spread = np.sqrt(noise * white + of_steps + max(between, default=0.0) ** 2)
+    of_means = rests.own + np.mean(rests.rounding**2, axis=1)
+    spread = np.sqrt(noise * white + of_means + max(between, default=0.0) ** 2)
     unsure = np.linalg.norm(force, axis=1) * np.radians(rests.creep_error) * 0.5 * rests.length
     v = rests.reading - accelerometer.bias
     shared = -accelerometer.matrix @ root[BIAS] + np.einsum("mj,ijp->mip", v, root[MATRIX].reshape(3, 3, -1))

@@ -92,7 +92,9 @@ def with_stage(before: SensorCalibration, stage: StageResult, model: Model, fitt
         matrix=fitted.state.matrix,
         stages=(*before.stages, replace(stage, residual_rms=rms)),
         converged=fitted.converged,
-        convergence=convergence_evidence(fitted.cosine, fitted.condition, rank, len(fitted.covariance)),
+        convergence=convergence_evidence(
+            fitted.cosine, fitted.condition, rank, len(fitted.covariance), at_minimum=fitted.cosine_at_minimum
+        ),
     )
 
 

@@ -159,6 +159,7 @@ RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests di
 # 1.7 except at the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
 TREMOR_LIMIT_DPS = 2.5
 SAME_DEG = 2.0  # the limit of a rest in ``pipeline.physics.signal.rests``
+ROUNDING_TERMS = 1000  # harmonics, with which u^2 of readings without noise is 6e-4 too small
 COARSE = float(np.sqrt(0.25 + 1.0 / 12.0))  # steps, scatter of readings with noise of half a step
 DIFFERENCE_BLOCK, MIN_DIFFERENCE_BLOCKS = 16, 8  # differences of a block; blocks of a recording that show its noise
 DECIMAL_ROUNDING = 1e-6  # relative, of a difference of decimals
@@ -213,18 +214,11 @@ def counts_of(differences: Values) -> Values:
     return np.asarray(np.where(np.isfinite(smallest), smallest, 0.0))
 
 
-def coarse_steps(readings: Sequence[Values]) -> Values:
-    """Return the step of the readings on each axis whose noise is below half a step, 0 on the others: (3,) array.
-
-    ``readings``: (n, 3) of each recording. White noise s in steps of d scatters by ``sqrt(s^2 + d^2 / 12)``, 0.58 d for
-    half a step; with less, the rounding error of a mean is the same however many readings it has. The noise is that of
-    the quietest recording: the first quartile of the white noise of its blocks.
-    """
-    return coarse_of([step_and_noise(values) for values in readings])
-
-
 def step_and_noise(values: Values) -> tuple[Values, Values]:
-    """Return the step and the noise of each axis of a recording's (n, 3) readings; infinite where unknown."""
+    """Return the step and the noise of each axis of a recording's (n, 3) readings; infinite where unknown.
+
+    The noise is the first quartile of the white noise of blocks, that of the quietest.
+    """
     unknown = np.full(3, np.inf)
     differences = np.abs(np.diff(values[np.isfinite(values).all(axis=1)], axis=0))
     count = len(differences) // DIFFERENCE_BLOCK
@@ -237,10 +231,32 @@ def step_and_noise(values: Values) -> tuple[Values, Values]:
 
 
 def coarse_of(found: Sequence[tuple[Values, Values]]) -> Values:
-    """Return ``coarse_steps`` of recordings by the ``step_and_noise`` of each."""
+    """Return the step of the readings on each axis whose noise is below half a step, 0 on the others: (3,) array.
+
+    ``found``: ``step_and_noise`` of each recording; the quietest counts. White noise s in steps of d scatters by
+    ``sqrt(s^2 + d^2 / 12)``, 0.58 d for half a step; with less, a mean has a rounding error (``rounding_of``), however
+    many readings it has.
+    """
     unknown = np.full(3, np.inf), np.full(3, np.inf)
     step, noise = (np.min(values, axis=0) for values in zip(unknown, *found, strict=True))
     return np.asarray(np.where(np.isfinite(step) & (noise < COARSE * step), step, 0.0), np.float64)
+
+
+def rounding_of(found: Sequence[tuple[Values, Values]]) -> Values:
+    """Return the standard uncertainty of means of coarse readings by rounding, 0 for other axes: (3,) array.
+
+    ``found``: ``step_and_noise`` of the recordings. Of white noise s in steps d, for a value anywhere in a step:
+    ``u^2 = d^2 / (2 pi^2) sum_k exp(-(2 pi k s / d)^2) / k^2``, which is ``d^2 / 12`` without noise and 4e-6 d^2 for
+    half a step (Widrow & Kollar 2008, Quantization Noise: by the characteristic function of the noise).
+    """
+    step = coarse_of(found)
+    noise = np.min([np.full(3, np.inf), *(noise for _, noise in found)], axis=0)
+    coarse, u = step > 0.0, np.zeros(3)
+    k = np.arange(1, ROUNDING_TERMS + 1)[:, None]
+    variance = np.maximum((noise[coarse] / step[coarse]) ** 2 - 1.0 / 12.0, 0.0)  # s^2 / d^2 (Sheppard 1898)
+    harmonics = np.sum(np.exp(-((2.0 * np.pi * k) ** 2) * variance) / k**2, axis=0)
+    u[coarse] = step[coarse] * np.sqrt(0.5 * harmonics) / np.pi
+    return u
 
 
 def windows(values: Values, size: int) -> tuple[Values, Values]:

@@ -11,6 +11,7 @@ from unit_settings import settings_of, with_noise
 
 from pipeline.core.records import BIAS, base_values
 from pipeline.estimation.stated_lines import with_stated
+from pipeline.physics.signal.quiet_motion import rounding_of
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 
@@ -30,3 +31,15 @@ def test_the_bias_is_within_an_uncertainty_that_holds_the_rounding(sensor: str, 
     assert np.all(np.abs(error) < 2.0 * U)
     if sensor == "accelerometer":  # the gyroscope's moves cross the steps, and determine its bias better than its rests
         assert np.all(step / np.sqrt(12.0) < U)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.2, 0.3, 0.4])
+def test_the_rounding_error_of_a_mean_is_that_of_values_anywhere_in_a_step(noise: float) -> None:
+    step, rng = 0.5, np.random.default_rng(1)
+    value = step * (np.arange(50) + 0.5) / 50  # evenly within a step
+    noisy = value[:, None] + noise * step * rng.standard_normal((50, 40_000))
+    error = (step * np.round(noisy / step)).mean(axis=1) - value
+    scatter = np.hypot(noise * step, step / np.sqrt(12.0))  # of the readings, over all values
+    u = rounding_of([(np.full(3, step), np.full(3, scatter))])
+    allowance = 0.002 * step  # the mean of 40,000 readings with noise of 0.4 steps scatters by as much
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(u[0], rel=0.03, abs=allowance)
