@@ -73,7 +73,8 @@ def assumed_figures(sensor: Sensor) -> str:
     """Return the sentence that lists the figures of a ``completed`` sensor from ``generic``; empty for none."""
     parts = [f"{', '.join(found)} of the {part}" for part in SENSORS if (found := sensor.of(part).assumed)]
     figures = ", and ".join(parts)
-    return f"the file of the sensor {sensor.name} does not state {figures}: generic's are used" if parts else ""
+    stated = not parts or sensor.name == "generic"
+    return "" if stated else f"the file of the sensor {sensor.name} does not state {figures}: generic's are used"
 
 
 def without_overridden(sensor: dict[str, Any], keys: set[str]) -> dict[str, Any]:

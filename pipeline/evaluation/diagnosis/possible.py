@@ -3,7 +3,8 @@
     beyond the sensor file      |p| - 1.96 u > 3 limit, unless the settings accept it
     by the thermometer          the temperature changes by less than its resolution
     by the Earth                a rate of more than the Earth's, 15.04 deg/h
-    by the noise                white noise of more than 3 times the sensor file's: the file is that of another sensor
+    by the noise                white noise of more than 3 times what the sensor's file states, so that the file is that of
+                                another sensor; ``generic`` is of no sensor, and states none
 
 Such effects fit best, and are listed as ``candidates``; the verdict is ``unexplained`` and nothing is offered.
 """
@@ -66,9 +67,9 @@ def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
         if span < resolution:
             return f"the temperature changes by {span:.2g} degC, less than its resolution of {resolution:.2g} degC"
     used = [r for r in case.recordings if r.reading(case.sensor) is not None]
-    if case.noise is not None and case.noise.step is None and used:
-        stated = sheet.noise_density * float(np.sqrt(0.5 / used[0].interval))
-        excess = float(np.min(case.noise.white)) / stated
+    density = sheet.stated("noise_density")
+    if density is not None and case.noise is not None and case.noise.step is None and used:
+        excess = float(np.min(case.noise.white)) / (density * float(np.sqrt(0.5 / used[0].interval)))
         if excess > TIMES_POSSIBLE:
             return f"the noise is {excess:.2g} times the sensor file's, so that the file is not that of this sensor"
     return ""
