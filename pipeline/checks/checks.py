@@ -86,8 +86,9 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
             )
             detail = (
                 f"{axes}: steps of {step:.3g} {SENSOR_UNITS[sensor]}{digits} and noise of less than half a step: "
-                f"means are off by up to {rounding[steps == step].max():.3g} {SENSOR_UNITS[sensor]}, however long the recording, and "
-                "effects of this size cannot be distinguished from rounding. Log more digits, or set a smaller range"
+                f"means are off by up to {rounding[steps == step].max():.3g} {SENSOR_UNITS[sensor]}, however long the "
+                "recording, and effects of this size cannot be distinguished from rounding. Log more digits, or set a "
+                "smaller range"
             )
             first = noted[own[0]]
             noted[own[0]] = replace(first, notes=(*first.notes, Note(RESOLUTION_NOTE, first.samples, 0, 0, detail)))

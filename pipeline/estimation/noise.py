@@ -123,7 +123,7 @@ def _not_below_rounding(noise: Noise, sensor: str, recordings: Sequence[Recordin
     if not np.any(constant | (steps > 0.0)):
         return noise
     stated = data_sheet.noise_density * np.sqrt(0.5 / recordings[0].interval)
-    white = np.maximum(np.where(constant, stated, noise.white), rounding)
+    white = np.maximum(np.where(constant, stated, noise.white), steps / np.sqrt(12.0))
     found = _with_stated_wander(white, data_sheet, "data_sheet" if constant.all() and stated else noise.source)
     return replace(found, step=steps, rounding=rounding) if np.any(steps > 0.0) else found
 

@@ -19,7 +19,7 @@ from pipeline.estimation.turns import stop_and_go
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.physics.kinematics import table_motion
 from pipeline.physics.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
-from pipeline.physics.signal.quiet_motion import rounding_of, creep_of_rest, posterior_creep_rates, step_and_noise
+from pipeline.physics.signal.quiet_motion import creep_of_rest, posterior_creep_rates, rounding_of, step_and_noise
 from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, usable
 
 if TYPE_CHECKING:

@@ -105,6 +105,8 @@ def test_validation_words_page_and_exports_know_it(bench: Bench, capsys: pytest.
     assert explain.main([str(bench.results)]) == 0
     words = capsys.readouterr().out
     assert "effect missing: found; accelerometer: loose part" in words
+    assert explain.main([str(bench.results), "found"]) == 0
+    words = capsys.readouterr().out
     assert "A loose part of the sensor tips over with gravity." in words
     assert "loose_part" in (bench.results / "reports" / "known.html").read_text()
     header = (bench.results / "exports" / "known" / "calibration.h").read_text()

@@ -285,8 +285,8 @@ def _fitted(
         columns.require_full_rank(PARAMETER_NAMES.tolist())
     except NotObservableError as lack:
         raise NotObservableError(
-            f"the {len(rows.rests.time)} orientations are too much alike: {lack.message} ({_unused(rows)}). Record rests "
-            "with each axis up, down and level, spread evenly"
+            f"the {len(rows.rests.time)} orientations are too much alike: {lack.message} ({_unused(rows)}). Record "
+            "rests with each axis up, down and level, spread evenly"
         ) from lack
     if not partly:  # far from a minimum that the orientations hardly determine, the fit would name others
         _require_known(np.linalg.norm(columns.weights(), axis=1), rows)
