@@ -3,8 +3,8 @@
     beyond the sensor file      |p| - 1.96 u > 3 limit, unless the settings accept it
     by the thermometer          the temperature changes by less than its resolution
     by the Earth                a rate of more than the Earth's, 15.04 deg/h
-    by the noise                white noise of more than 3 times what the sensor's file states: it is that of another sensor;
-                                ``generic`` is of no sensor, and states none
+    by the noise                white noise of more than 3 times what the sensor's file states: that of another sensor
+                                (``generic`` is of no sensor, and states none)
 
 Such effects fit best, and are listed as ``candidates``; the verdict is ``unexplained`` and nothing is offered.
 """
