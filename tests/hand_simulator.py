@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.signal
 from unit_settings import settings_of
 
 from pipeline.core.records import Recording
@@ -44,6 +45,8 @@ class Hand:
         Standard deviation of the rate at which a unit turns in a rest, about each axis; at most 0.3.
     settle_deg : float
         Standard deviation, per axis, of an angle by which each move is wrongly known: what its ends are off gravity.
+    slow_s : float, s
+        Time constant of a filter of first order in the accelerometer, before its noise; 0 for none.
     jitter : float
         Share of a sampling interval by which stamps are late, at most; they come in bursts of three.
     white : dict of str to float
@@ -61,6 +64,7 @@ class Hand:
     tail_dps: tuple[float, float] = (0.0, 0.0)
     creep_dps: float = 0.0
     settle_deg: float = 0.0
+    slow_s: float = 0.0
     jitter: float = 0.0
     wander: dict[str, float] = field(default_factory=lambda: {"accelerometer": 1e-4, "gyroscope": 3e-3})
     white: dict[str, float] = field(default_factory=lambda: {"accelerometer": 2.8e-3, "gyroscope": 0.035})
@@ -137,6 +141,9 @@ def draw_together(hand: Hand, seed: int, units: int) -> list[Drawn]:
         edges = np.flatnonzero(np.diff(still.astype(int)) != 0)
         off = hand.settle_deg / GRAVITY_DPS * rng.standard_normal((hand.rests + 1, 3))
         felt = felt + np.cross(off[np.searchsorted(edges, np.arange(len(still))) // 2], felt)
+    if hand.slow_s:
+        keep = np.exp(-step / hand.slow_s)
+        felt = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], felt, axis=0, zi=keep * felt[:1])[0]
     return [_read(hand, rng, rate, felt, still) for _ in range(units)]
 
 

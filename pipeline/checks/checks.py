@@ -30,6 +30,7 @@ from pipeline.core.records import SENSOR_UNITS, SENSORS, Note
 from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.physics.kinematics import normal_gravity_g
 from pipeline.physics.signal.quiet_motion import coarse_of, rounding_of, step_and_noise
+from pipeline.physics.signal.rests import settling_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -65,7 +66,7 @@ def check_recordings(recordings: Sequence[Recording], settings: Settings) -> lis
     """
     _check_shared_rows(recordings)
     check_axes(recordings)
-    recordings = _with_steps(with_rates_at_rest(recordings))
+    recordings = _with_settling(_with_steps(with_rates_at_rest(recordings)))
     turns, delays = check_turns(check_static(recordings, settings), settings)
     checked = refined(check_motion(check_mounting(turns, settings), delays, settings))
     return _placed(checked, settings.table)
@@ -92,6 +93,29 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
             )
             first = noted[own[0]]
             noted[own[0]] = replace(first, notes=(*first.notes, Note(RESOLUTION_NOTE, first.samples, 0, 0, detail)))
+    return noted
+
+
+def _with_settling(recordings: Sequence[Recording]) -> Sequence[Recording]:
+    """Note an accelerometer that settles in the rests by hand, with the time that is left out or would be needed."""
+    noted = list(recordings)
+    for k, recording in enumerate(recordings):
+        by_hand = recording.role in {"rests", "validation"} and recording.logged_rate is None
+        settling = settling_of(recording) if by_hand else None
+        if settling is None:
+            continue
+        detail = (
+            f"after moves the accelerometer settles with a time constant of {settling.time_s:.2g} s, as with a slow "
+            f"filter; it is settled {settling.left_out_s:.2g} s after a rest was found"
+        )
+        detail += (
+            f", and the rests are too short for that: their means are off by {settling.left_g:.2g} g. Rest longer, or "
+            "log without this filter"
+            if settling.clear
+            else ", and this time is left out of every rest"
+        )
+        note = Note("N-REFERENCE" if settling.clear else "N-SETTLING", recording.samples, 0, 0, detail)
+        noted[k] = replace(recording, notes=(*recording.notes, note))
     return noted
 
 

@@ -9,7 +9,15 @@ import pytest
 from hand_simulator import Hand, draw
 
 from pipeline.core.records import Recording
-from pipeline.physics.signal.rests import Rest, assess_rests, find_rests, rests_from_table, runs, still_samples
+from pipeline.physics.signal.rests import (
+    Rest,
+    assess_rests,
+    find_rests,
+    rests_from_table,
+    runs,
+    settling_of,
+    still_samples,
+)
 
 DATA = Path(__file__).parents[2] / "../shared/data"
 needs_data = pytest.mark.skipif(not DATA.exists(), reason="reference data not beside the repository")
@@ -104,6 +112,25 @@ def test_rests_are_found_at_the_sampling_rate_of_a_slow_logger() -> None:
     force, rate, truth = _rests_and_moves(rest_s=9.0)
     slow = _recording(force, rate).select(slice(0, None, 12))
     assert [rest.accepted for rest in find_rests(slow)] == [True] * len(truth)
+
+
+@pytest.mark.parametrize(("slow_s", "rest_s", "clear"), [(0.3, 4.0, False), (0.3, 2.0, True)])
+def test_rests_begin_when_a_slow_filter_has_settled(slow_s: float, rest_s: float, *, clear: bool) -> None:
+    """The truth is the same motion without the filter: means agree, or the settling is named."""
+    steady, slow = (draw(Hand(rests=16, rest_s=rest_s, slow_s=value), 5).recording for value in (0.0, slow_s))
+    assert settling_of(steady) is None
+    settling = settling_of(slow)
+    assert settling is not None
+    assert settling.time_s == pytest.approx(slow_s, rel=0.15)
+    assert settling.clear == clear
+    rests = find_rests(slow)
+    assert steady.accelerometer is not None
+    assert slow.accelerometer is not None
+    before = np.array([steady.accelerometer[r.start : r.stop].mean(axis=0) for r in rests])
+    errors = np.array([slow.accelerometer[r.start : r.stop].mean(axis=0) for r in rests]) - before  # the same noise
+    apart = before[:-1] - before[1:]
+    off = np.mean(np.sum(errors[1:] * apart, axis=1) / np.linalg.norm(apart, axis=1))
+    assert off == pytest.approx(settling.left_g, rel=0.5, abs=2e-5)  # 0.02 mg: the noise of all means together
 
 
 def test_a_rest_that_turns_slowly_is_refused() -> None:

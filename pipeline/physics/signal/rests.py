@@ -16,6 +16,10 @@ A rest is trimmed by W at its start. A gyroscope must be quiet, too (``pipeline.
 turn about the vertical does not change the specific force. A rest is refused if its angular rate differs from that of
 the neighbouring rests, the direction of the specific force moves, or the readings scatter more than noise. A turn by
 theta shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
+
+An accelerometer with a slow filter still settles when a rest begins: its readings are off towards those of the rest
+before, by ``A exp(-t / T)`` on average over the rests. The start of every rest is left out until the rest of it changes
+no mean by a tenth of the noise that all means have together (``Settling``).
 """
 
 from __future__ import annotations
@@ -54,6 +58,12 @@ SIGNIFICANT_REST_DEVIATIONS = 6.0  # standard deviations
 REST_EDGE_S, FEWEST_TO_SETTLE = 0.5, 6  # edge of a rest that may move, at most a third of it; samples that this needs
 SETTLED_DIFFERENCE_DEVIATIONS = 8.0  # of the noise between successive samples: white noise passes in 1e-14
 
+SETTLING_BLOCK_S, SETTLING_BLOCKS, FEWEST_SETTLING = 0.1, 20, 8  # blocks from the start of rests; rests that show it
+APART_G = 0.2  # between two rests, by which the direction of the settling is known
+SETTLES_DEVIATIONS = 6.0  # standard deviations by the scatter between rests; published recordings reach 2.6
+SETTLING_TIMES_S = np.geomspace(0.05, 3.0, 40)  # T; shorter ones have settled where the variance is low
+SETTLED_SHARE = 0.1  # of the noise of the mean of all rests, see above
+
 RATE_AT_REST = "rate_at_rest_dps"  # in the source of a turn: what the gyroscope reads in the recordings at rest
 SLOW_PARTS, SLOW_PART_S = 120, 0.2  # parts of slow movement: a turn at 30 deg/s shortens their mean by 0.5 mg
 SOAK_PARTS = 40  # of a soak: over a span of 80 degC, 2 degC each
@@ -67,6 +77,16 @@ class Rest:
     stop: int
     accepted: bool = True
     reason: str = ""
+
+
+@dataclass(frozen=True)
+class Settling:
+    """How the readings of the accelerometer settle after moves; see the module."""
+
+    time_s: float  # T
+    left_out_s: float  # at the start of each rest, as far as a rest of 1 s remains
+    left_g: float  # mean error of the rests that remains
+    clear: bool  # whether this error is larger than the noise of the mean of all rests
 
 
 def runs(mask: Mask) -> Spans:
@@ -138,21 +158,76 @@ def find_rests(recording: Recording) -> list[Rest]:
 
 
 def _rests_by_readings(recording: Recording) -> list[Rest]:
+    pieces, noise = _quiet_parts(recording)
+    settling = settling_of(recording)
+    if settling is not None:
+        interval = _interval(recording)
+        cut, shortest = round(settling.left_out_s / interval), _shortest(recording)
+        pieces = [(max(a, min(a + cut, b - shortest)), b) for a, b in pieces]
+    return assess_rests(recording, pieces, noise)
+
+
+@once
+def _quiet_parts(recording: Recording) -> tuple[Spans, float]:
+    """Return the parts in which both sensors are quiet, and the noise: variance of the specific force, g^2."""
     force = recording.accelerometer
     size = max(5, round(WINDOW_S / _interval(recording))) if recording.samples > 1 else 5
     if force is None or recording.samples < 2 * size:
-        return []
+        return [], 0.0
     variance = windows(force, size)[1]
     rounding = float(np.sum(counts_of(np.abs(np.diff(force[np.isfinite(force).all(axis=1)], axis=0))) ** 2)) / 12.0
     noise = max(float(np.percentile(variance, 5.0)), rounding, MIN_NOISE_VARIANCE_G2)
     variance[_spoilt(recording, size)] = np.inf
     found = [_below(variance, multiple * noise, recording, size) for multiple in VARIANCE_MULTIPLES]
     quiet = found[_plateau([len(rests) for rests in found])]
-    rate = recording.gyroscope
-    if rate is not None and quiet:
-        interval = _interval(recording)
-        quiet = quiet_pieces(rate, quiet, interval, max(size, round(SHORTEST_REST_S / interval)))
-    return assess_rests(recording, quiet, noise)
+    if recording.gyroscope is not None and quiet:
+        quiet = quiet_pieces(recording.gyroscope, quiet, _interval(recording), _shortest(recording))
+    return quiet, noise
+
+
+@once
+def settling_of(recording: Recording) -> Settling | None:
+    """Return how the accelerometer settles after the moves of a recording by hand; None where that is not seen."""
+    pieces, _ = _quiet_parts(recording)
+    block = max(1, round(SETTLING_BLOCK_S / _interval(recording))) if pieces else 1
+    force = recording.accelerometer
+    if force is None or len(pieces) <= FEWEST_SETTLING:
+        return None
+    level = np.array([force[(a + b) // 2 : b].mean(axis=0) for a, b in pieces])
+    apart = level[:-1] - level[1:]
+    size = np.linalg.norm(apart, axis=1)
+    off = np.full((len(apart), SETTLING_BLOCKS), np.nan)  # of each block towards the rest before
+    for k, (a, b) in enumerate(pieces[1:]):
+        count = min((b - a) // 2 // block, SETTLING_BLOCKS) if size[k] > APART_G else 0
+        readings = (force[a : a + count * block] - level[k + 1]) @ apart[k]
+        off[k, :count] = readings.reshape(count, block).mean(axis=1) / size[k] if count else 0.0
+    seen = np.isfinite(off).sum(axis=0)
+    off = off[:, seen >= FEWEST_SETTLING]
+    if off.shape[1] < 2 or np.nanmean(off[:, 0]) <= 0.0:
+        return None
+    mean, spread = np.nanmean(off, axis=0), np.nanstd(off, axis=0, ddof=1) / np.sqrt(seen[: off.shape[1]])
+    if mean[0] <= SETTLES_DEVIATIONS * spread[0]:
+        return None
+    lengths = np.array([b - a for a, b in pieces]) * _interval(recording)
+    half = 0.5 * float(np.median(lengths))
+    middle = (np.arange(len(mean)) + 0.5) * block * _interval(recording)
+    shapes = np.exp(-middle / SETTLING_TIMES_S[:, None])
+    of_level = SETTLING_TIMES_S / half * np.exp(-half / SETTLING_TIMES_S) * (1.0 - np.exp(-half / SETTLING_TIMES_S))
+    shapes -= of_level[:, None]
+    size_of = shapes @ mean / np.sum(shapes**2, axis=1)
+    best = int(np.argmax(size_of * (shapes @ mean)))
+    T, A = float(SETTLING_TIMES_S[best]), float(size_of[best])
+    white = float(spread[-1] * np.sqrt(block * _interval(recording) / (2.0 * half)))
+    left_out = max(T * float(np.log(A * T / (2.0 * half * SETTLED_SHARE * white))), 0.0)
+    kept = np.maximum(lengths - left_out, np.minimum(SHORTEST_REST_S, lengths))
+    left = float(np.mean(A * T / kept * np.exp(-(lengths - kept) / T)))
+    return Settling(T, left_out, left, clear=left > white)
+
+
+def _shortest(recording: Recording) -> int:
+    """Return the samples of the shortest rest."""
+    interval = _interval(recording)
+    return max(5, round(WINDOW_S / interval), round(SHORTEST_REST_S / interval))
 
 
 def _interval(recording: Recording) -> float:
@@ -192,7 +267,7 @@ def _below(variance: Values, threshold: float, recording: Recording, size: int) 
     """Return the trimmed stretches whose windows are below a threshold, if they are long enough."""
     interval = _interval(recording)
     lag = int(np.ceil(5.0 * float(recording.filter.get("delay_s", 0.0)) / interval))
-    shortest = max(size, round(SHORTEST_REST_S / interval))
+    shortest = _shortest(recording)
     trimmed = ((start + size + lag, stop - 1) for start, stop in runs(variance < threshold))
     return [(start, stop) for start, stop in trimmed if stop - start >= shortest]
 
