@@ -49,7 +49,7 @@ STEPS = {  # in the order of a run
     "calibration": Step(
         "calibration.calibration_document",
         ("unit", "checked", "fits", "validated", "diagnosis"),
-        (*BENCH_SECTIONS, "method", "ingest", "stated"),
+        (*BENCH_SECTIONS, "method", "ingest", "diagnosis", "stated"),
         "calibration",
     ),
     "export": Step("export.export", DOCUMENTS, ("sensor", "table"), "exports"),

@@ -83,6 +83,20 @@ def turned(frame: pd.DataFrame) -> pd.DataFrame:
     return out
 
 
+def test_the_noise_of_a_run_has_no_intervals_and_names_what_gives_them(campaign: Path) -> None:
+    parts = [
+        pipeline.calibrate_unit(campaign, "U001", overrides=overrides).calibration["noise"]["gyroscope"]
+        for overrides in ((), ["diagnosis.depth=full"])
+    ]
+    stated, full = (part["axes"]["x"]["terms"]["white"] for part in parts)
+    command = "python -m pipeline noise raw/U001/static.csv --ingest canonical_csv --sensor mpu6050"
+    assert parts[0]["intervals_by"] == f"{command}, or a run with diagnosis.depth=full"
+    assert stated["interval"] is None
+    assert "intervals_by" not in parts[1]
+    low, high = full["interval"]
+    assert low < stated["value"] < high
+
+
 def assert_same_figures(one: Any, two: Any, place: str = "") -> None:
     """Compare two documents: numbers to 1e-12 of their size, everything else exactly."""
     if isinstance(one, dict):

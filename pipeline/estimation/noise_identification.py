@@ -13,6 +13,10 @@ temperature are regressed out.
 A fit is in doubt if the power of the spectrum in bins of frequency differs from the model: the cube root of a
 chi-square variable over its degrees of freedom m is normal with mean 1 - 2/(9m) and variance 2/(9m) (Wilson & Hilferty,
 PNAS 17, 1931).
+
+A run states N, B and K alone, without intervals: the composition of them with the smallest BIC, where the Allan
+variances of octaves are independent and chi-square distributed about ``N^2 / t + (2 ln 2 / pi) B^2 + K^2 t / 3``. They
+are in doubt if an Allan variance differs from the sum.
 """
 
 from __future__ import annotations
@@ -34,15 +38,18 @@ from pipeline.estimation.noise_search import (
     limits,
 )
 from pipeline.estimation.noise_terms import (
+    INSTABILITY,
     MARKOV,
     SINGLE,
     STOCHASTIC,
+    WALK,
     WHITE,
     TermTrial,
     allan_deviation,
     allan_variance,
     at_once,
     evaluate,
+    octave_variances,
     solved,
     spectrum_of,
     unit_of,
@@ -51,7 +58,7 @@ from pipeline.physics.signal.filters import temperature_of
 from pipeline.physics.signal.rests import rest_readings, usable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.core.files import JSON
     from pipeline.core.records import Recording, Values
@@ -78,6 +85,13 @@ NOT_FITTED = {
     "ramp": "only a static recording shows it",
     "temperature": "the temperature did not change, or only as a ramp",
 }
+N_B_K = (WHITE, INSTABILITY, WALK)
+TERM_SETS = np.array([[1, 0, 0], [1, 1, 0], [1, 0, 1], [1, 1, 1]], bool)  # of N, B and K
+SCORINGS, LEAST_SHARE = 12, 1e-12  # of the scoring; smallest share of a term in an Allan variance
+MOST_DEPARTURE = 6.0  # standard deviations of an Allan variance about the sum of N, B and K
+NOT_OF_A_RUN = "a run states N, B and K alone"
+NOT_SHOWN = "the Allan deviation does not show it"
+OTHER_SPECTRUM = "the Allan deviation is not that of N, B and K: a filter, vibration, drift or a disturbance"
 
 
 @dataclass(frozen=True)
@@ -85,7 +99,7 @@ class Bounded:
     """A value and its 95 % interval."""
 
     value: float
-    interval: list[float]
+    interval: list[float] | None  # None: not determined
 
     @classmethod
     def of(cls, value: float, spread: float) -> Self:
@@ -127,10 +141,10 @@ class UnseenTerm:
         return {"value": None, "interval": None, **vars(self)}
 
 
-def identify_noise(recordings: Sequence[Recording]) -> dict[str, JSON]:
+def identify_noise(recordings: Sequence[Recording], *, full: bool = True) -> dict[str, JSON]:
     """Return the noise of each sensor, from its recordings before any filter: see the schema of calibrations.
 
-    Axes whose readings have the same sampling are fitted together.
+    Axes whose readings have the same sampling are fitted together. ``full``: False states N, B and K alone.
     """
     documents: dict[str, JSON] = {}
     same_sampling: dict[tuple[Any, ...], list[tuple[str, Regression]]] = {}
@@ -138,6 +152,9 @@ def identify_noise(recordings: Sequence[Recording]) -> dict[str, JSON]:
         document, stretches = _source(sensor, recordings)
         documents[sensor] = document
         if not stretches:
+            continue
+        if not full:
+            document["axes"] = _stated(document["unit"], stretches, document["sampling_interval_s"])
             continue
         document["axes"] = dict.fromkeys(AXES, CONSTANT_READINGS)
         single = document["source"] == "static" and len(document["recordings"]) == 1
@@ -255,8 +272,7 @@ def _axis(
     doubts = []
     if p_value < LEAST_FIT_PROBABILITY:
         doubts.append(f"no composition fits the spectrum (p = {p_value:.1g}): a filter, vibration or a disturbance")
-    if regression.scale < COARSE_COUNTS * regression.count:
-        doubts.append(f"the readings are rounded to {regression.count:.3g} {unit}, which is coarser than their noise")
+    doubts += _coarse(regression.scale, regression.count, unit)
     candidates = sorted(search.found.values(), key=lambda c: c.bic)
     weight = np.exp(-0.5 * (np.array([c.bic for c in candidates]) - best.bic))
     probability = (weight / weight.sum()).tolist()
@@ -291,6 +307,72 @@ def _axis(
         "allan": _allan(*measured, best, present, others, spectrum),
         "doubts": doubts,
     }
+
+
+def _coarse(scale: float, count: float, unit: str) -> list[str]:
+    """Return a doubt if the readings are rounded more coarsely than their noise."""
+    coarse = scale < COARSE_COUNTS * count
+    return [f"the readings are rounded to {count:.3g} {unit}, which is coarser than their noise"] * coarse
+
+
+def _stated(unit: str, stretches: Sequence[RestStretch], interval: float) -> JSON:
+    """Return N, B and K of each axis by the Allan variances of octaves, without intervals."""
+    readings = [s.reading for s in stretches]
+    steps = np.concatenate([np.abs(np.diff(values, axis=0)) for values in readings])
+    scale = np.sqrt(np.mean(steps**2, axis=0) / 2.0)
+    tau, variance, freedom = octave_variances([values / np.maximum(scale, 1e-300) for values in readings], interval)
+    squares, limits, sums = _fitted_octaves(tau, variance.T, freedom, sum(map(len, readings)))
+    departure = np.abs(variance.T / np.maximum(sums, 1e-300) - 1.0) * np.sqrt(0.5 * freedom)
+    axes: JSON = dict.fromkeys(AXES, CONSTANT_READINGS)
+    for c in np.flatnonzero(steps.any(axis=0)).tolist():
+        terms: dict[str, SeenTerm | UnseenTerm] = {"temperature": UnseenTerm(f"{unit}/degC", NOT_OF_A_RUN)}
+        terms |= {name: UnseenTerm(unit_of(name, unit), NOT_OF_A_RUN) for name in ("quantisation", "ramp")}
+        for kind, square, limit in zip(N_B_K, squares[c], limits[c], strict=True):
+            name, size = STOCHASTIC[kind], float(scale[c] * np.sqrt(square))
+            absent = UnseenTerm(unit_of(name, unit), NOT_SHOWN, float(scale[c] * np.sqrt(limit)))
+            terms[name] = SeenTerm(name, Bounded(size, None), unit_of(name, unit)) if size else absent
+        doubts = [OTHER_SPECTRUM] if departure[c].max() > MOST_DEPARTURE else []
+        count = float(steps[steps[:, c] > 1e-9 * scale[c], c].min())
+        curves = {"tau_s": tau, "deviation": scale[c] * np.sqrt(variance[:, c]), "fit": scale[c] * np.sqrt(sums[c])}
+        axes[AXES[c]] = {
+            "terms": {name: term.to_json() for name, term in terms.items()} | {STOCHASTIC[MARKOV]: [], "sinusoid": []},
+            "reason": None,
+            "ranking": [],
+            "p_value": None,
+            "allan": _rounded(curves) | {"low": None, "high": None},
+            "doubts": [*doubts, *_coarse(float(scale[c]), count, unit)],
+        }
+    return axes
+
+
+def _fitted_octaves(tau: Values, variance: Values, freedom: Values, samples: int) -> tuple[Values, Values, Values]:
+    """Return N^2, B^2 and K^2 of each axis, 0 where absent, upper limits of absent ones, and the sums of the terms.
+
+    ``variance``: (a, m). Returns (a, 3), (a, 3) and (a, m) arrays. Each set of terms is fitted by Fisher scoring.
+    """
+    shapes = np.stack([allan_variance(STOCHASTIC[kind], 1.0, tau) for kind in N_B_K])
+
+    def solved_sets(sums: Values, sets: Values) -> tuple[Values, Values]:
+        """Return squares and their covariance, (..., 3) and (..., 3, 3); ``sums``: (..., m), by which to weight."""
+        relative = np.where(sets[..., None], shapes, 0.0) / sums[..., None, :]
+        information = 0.5 * (relative * freedom) @ relative.swapaxes(-1, -2)
+        np.einsum("...jj->...j", information)[...] += np.where(sets, 0.0, 1.0)
+        covariance = np.asarray(np.linalg.inv(information), np.float64)
+        ratio = variance[:, None] / sums
+        return (covariance @ (0.5 * (relative * freedom) @ ratio[..., None]))[..., 0], covariance
+
+    sums = np.repeat(variance[:, None], len(TERM_SETS), axis=1)
+    for _ in range(SCORINGS):
+        squares, _ = solved_sets(sums, TERM_SETS)
+        sums = np.maximum(squares, LEAST_SHARE * variance.min(axis=1)[:, None, None]) @ shapes
+    loss = np.sum(freedom * (np.log(sums) + variance[:, None] / sums), axis=2) + np.log(samples) * TERM_SETS.sum(axis=1)
+    loss[np.any((squares <= 0.0) & TERM_SETS, axis=2)] = np.inf
+    rows, best = np.arange(len(variance)), np.argmin(loss, axis=1)
+    squares, sums = np.where(TERM_SETS[best], squares[rows, best], 0.0), sums[rows, best]
+    more, covariance = solved_sets(sums[:, None], TERM_SETS[best][:, None] | np.eye(3, dtype=bool))
+    spread = np.sqrt(np.einsum("ajkk->ajk", covariance))
+    limits = np.einsum("ajj->aj", np.maximum(more, 0.0) + ONE_SIDED * spread)
+    return squares, limits, sums
 
 
 def _present(best: FittedComposition, within: Values, regression: Regression) -> list[SeenTerm]:
@@ -330,7 +412,8 @@ def _allan(  # noqa: PLR0917  (the curve and its terms)
     covariance = best.fit.covariance(spectrum.count)[0]
     variance = np.maximum(np.einsum("it,ij,jt->t", jacobian, covariance, jacobian), 0.0)
     for coefficient, part in others:  # by the interval of the coefficient
-        variance += (part / total * np.diff(coefficient.interval)[0] / coefficient.value / QUANTILE) ** 2
+        low, high = coefficient.interval or (np.nan, np.nan)
+        variance += (part / total * (high - low) / coefficient.value / QUANTILE) ** 2
     half, deviation = QUANTILE * np.sqrt(variance), np.sqrt(total)
     curves = {
         "tau_s": tau,
@@ -339,6 +422,10 @@ def _allan(  # noqa: PLR0917  (the curve and its terms)
         "low": deviation * np.exp(-0.5 * half),
         "high": deviation * np.exp(0.5 * half),
     }
+    return _rounded(curves)
+
+
+def _rounded(curves: Mapping[str, Values]) -> JSON:
     return {name: [float(f"{v:.5g}") for v in values] for name, values in curves.items()}
 
 

@@ -139,6 +139,32 @@ def allan_deviation(values: Values, interval: float, points_per_decade: int = 10
     return lengths.astype(np.float64) * interval, deviation.reshape(-1, *values.shape[1:])
 
 
+def octave_variances(stretches: Sequence[Values], interval: float) -> tuple[Values, Values, Values]:
+    """Return averaging times of octaves, s, Allan variances of all (n, k) stretches together, and degrees of freedom.
+
+    (m,), (m, k) and (m,) arrays. The longest time is a quarter of the longest stretch. The degrees of freedom are those
+    of white noise (Riley, NIST SP 1065, table 5).
+    """
+    longest = max(len(values) for values in stretches) // 4
+    lengths = 2 ** np.arange(int(np.log2(longest)) + 1)
+    squares, terms, freedom = (
+        np.zeros((len(lengths), stretches[0].shape[1])),
+        np.zeros(len(lengths)),
+        np.zeros(len(lengths)),
+    )
+    for values in stretches:
+        n = len(values)
+        theta = np.zeros((n + 1, values.shape[1]))
+        np.cumsum(values - values.mean(axis=0), axis=0, out=theta[1:])
+        for row, m in enumerate(lengths[: int(np.log2(n // 4)) + 1].tolist()):
+            step = max(1, m // PER_AVERAGE)
+            second = theta[2 * m :: step] - 2.0 * theta[m:-m:step] + theta[: -2 * m : step]
+            squares[row] += np.einsum("ik,ik->k", second, second)
+            terms[row] += len(second)
+            freedom[row] += (1.5 * n / m - 2.0 * (n - 1) / (n + 1)) * 4.0 * m**2 / (4.0 * m**2 + 5.0)
+    return lengths.astype(np.float64) * interval, squares / (2.0 * lengths**2 * terms)[:, None], freedom
+
+
 @dataclass(frozen=True)
 class Spectrum:
     """Coefficients of the axes in b bins of frequency."""

@@ -175,6 +175,54 @@ def test_a_slow_change_with_temperature_is_no_noise() -> None:
     assert found["axes"]["x"]["ranking"][0]["terms"] == ["white", "temperature"]
 
 
+def test_a_run_states_n_b_and_k_within_the_intervals_of_the_full_identification() -> None:
+    rng = np.random.default_rng(11)
+    columns = [simulated(rng, 20_000, K=K) for K in (0.0, 0.1, 0.03)]
+    rest = recording(np.stack(columns, axis=1))
+    stated, full = (identify_noise([rest], full=each)["gyroscope"]["axes"] for each in (False, True))
+    for axis in "xyz":
+        terms, others = stated[axis]["terms"], full[axis]["terms"]
+        assert terms.keys() == others.keys()
+        assert stated[axis].keys() == full[axis].keys()
+        for name in ("white", "random_walk"):
+            assert terms[name]["interval"] is None
+            assert (terms[name]["value"] is None) == (others[name]["value"] is None)
+            if terms[name]["value"]:
+                low, high = others[name]["interval"]
+                assert low < terms[name]["value"] < high
+        curve = stated[axis]["allan"]
+        assert curve["low"] is None
+        np.testing.assert_allclose(curve["deviation"][:8], curve["fit"][:8], rtol=0.1)
+
+
+def test_upper_limits_of_a_run_hold_in_95_percent_of_recordings() -> None:
+    rng, K, covered = np.random.default_rng(13), 0.02, []
+    for _ in range(60):
+        rest = recording(np.stack([simulated(rng, 1000, K=K) for _ in "xyz"], axis=1))
+        walks = [a["terms"]["random_walk"] for a in identify_noise([rest], full=False)["gyroscope"]["axes"].values()]
+        covered += [walk["upper_limit"] > K for walk in walks if walk["value"] is None]
+    assert len(covered) > 150
+    assert np.mean(covered) == pytest.approx(0.95, abs=0.06)  # 3 standard deviations of a share
+
+
+def test_n_b_and_k_are_those_of_all_stretches_together() -> None:
+    values = np.random.default_rng(12).standard_normal(6000) / np.sqrt(DT)
+    flags = np.zeros(6000, np.uint16)
+    for start in range(100, 6000, 110):
+        flags[start : start + 12] = 2  # longer than a gap that is bridged
+    rest = recording(values, flags=flags)
+    white = identify_noise([rest], full=False)["gyroscope"]["axes"]["x"]["terms"]["white"]["value"]
+    used = sum(len(s.time) for s in static_stretches("gyroscope", rest))
+    assert used > 5000
+    assert white == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * used))
+
+
+def test_an_allan_deviation_of_another_noise_is_in_doubt() -> None:
+    band = lfilter([1.0], [1.0, -1.6, 0.95], np.random.default_rng(8).standard_normal(20_000))
+    (doubt,) = identify_noise([recording(np.asarray(band))], full=False)["gyroscope"]["axes"]["x"]["doubts"]
+    assert "not that of N, B and K" in doubt
+
+
 def test_short_gaps_and_marked_samples_are_bridged_and_long_ones_cut() -> None:
     whole = recording(np.arange(1000.0))
     flags = np.zeros(1000, np.uint16)

@@ -72,7 +72,7 @@ def calibration_document(  # noqa: PLR0917  (what a calibration is composed of)
         "inputs": inputs(checked),
         "calibrated_range": calibrated_range(checked),
         "not_calibrated": reasons,
-        "noise": identify_noise(checked),
+        "noise": _noise(checked, settings),
     }
     hidden = {sensor: _hidden(diagnosis.get(sensor)) for sensor in SENSORS}
     for sensor, fit in fits.items():
@@ -82,6 +82,21 @@ def calibration_document(  # noqa: PLR0917  (what a calibration is composed of)
             part["frame_deg"] = frame_uncertainty(fit, checked, settings)
             document[sensor] = judged(sensor, part, settings.sensor.of(sensor))
     return document
+
+
+def _noise(checked: Sequence[Recording], settings: Settings) -> dict[str, Any]:
+    """Return the noise at rest; with ``diagnosis.depth=standard`` without intervals, and with what gives them."""
+    full = settings.diagnosis.depth == "full"
+    noise = identify_noise(checked, full=full)
+    for part in noise.values():
+        if part["axes"] and not full:
+            part["intervals_by"] = "a run with diagnosis.depth=full"
+            if part["source"] == "static":
+                file = next(r.source.get("file") for r in checked if r.name == part["recordings"][0])
+                chosen = {"ingest": settings.ingest.name, "sensor": settings.sensor.name}
+                options = "".join(f" --{key} {name}" for key, name in chosen.items())
+                part["intervals_by"] = f"python -m pipeline noise {file}{options}, or {part['intervals_by']}"
+    return noise
 
 
 def _hidden(part: Mapping[str, Any] | None) -> dict[str, str] | None:

@@ -106,7 +106,8 @@ def noise_figures(sensor: str, sheet: SensorFigures | None, document: Mapping[st
     of_white, walks = zip(*(_white_and_walk(terms, longest_s) for terms in axes), strict=True)
     whites = [w for w in of_white if w is not None]
     if whites:
-        figures["white"], *figures["white_interval"] = _rms(whites)
+        figures["white"], *interval = _rms(whites)
+        figures["white_interval"] = _known(interval)
         figures["white_origin"] = f"measured at rest ({identified['source']}), root mean square of the axes"
     measured = [w for w in walks if w is not None]
     limits = [t["random_walk"].get("upper_limit") for t, w in zip(axes, walks, strict=True) if w is None]
@@ -119,7 +120,7 @@ def noise_figures(sensor: str, sheet: SensorFigures | None, document: Mapping[st
             "configuration and the upper limit"
         )
     elif measured:
-        figures |= {"walk_origin": "measured at rest", "walk_interval": _rms(measured)[1:]}
+        figures |= {"walk_origin": "measured at rest", "walk_interval": _known(_rms(measured)[1:])}
     elif bounds:
         limit = f"{UNIT_FACTORS[SI[sensor]] * max(v for v in limits if v):.3g} {SI[sensor]}/sqrt(s)"
         figures["walk_origin"] = (
@@ -129,6 +130,10 @@ def noise_figures(sensor: str, sheet: SensorFigures | None, document: Mapping[st
     return figures
 
 
+def _known(interval: list[float]) -> list[float] | None:
+    return interval if np.all(np.isfinite(interval)) else None
+
+
 def _white_and_walk(terms: JSON, longest_s: float) -> list[Values | None]:
     """Return white noise and walk of an axis, each with the ends of its interval, (3,); None without a term.
 
@@ -136,7 +141,8 @@ def _white_and_walk(terms: JSON, longest_s: float) -> list[Values | None]:
     """
 
     def intervals(*parts: JSON) -> list[Values]:
-        return [np.array([p["value"], *p["interval"]], float) for p in parts if p["value"] is not None]
+        ends = (p["interval"] or (np.nan, np.nan) for p in parts)
+        return [np.array([p["value"], *e], float) for p, e in zip(parts, ends, strict=True) if p["value"] is not None]
 
     processes = [(part, part["correlation_time_s"]["value"]) for part in terms["gauss_markov"]]
     fast = [

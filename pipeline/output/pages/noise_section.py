@@ -40,8 +40,8 @@ def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON |
     unit, layers, density = SENSOR_UNITS[sensor], list[ChartLayer](), data_sheet.stated("noise_density")
     for axis, part in axes.items():
         curve, colour = {k: np.array(v) for k, v in part["allan"].items()}, AXES.index(axis)
+        layers += [Area(curve["low"], curve["high"], colour, curve["tau_s"])] if part["allan"]["low"] else []
         layers += [
-            Area(curve["low"], curve["high"], colour, curve["tau_s"]),
             LineMark(curve["tau_s"], curve["fit"], colour, "model"),
             Dots(curve["tau_s"], curve["deviation"], colour),
         ]
@@ -95,6 +95,7 @@ def remarks(noise: JSON | None) -> list[str]:
     if not noise:
         return []
     texts = [f"Not identified: {noise['reason']}."] if noise["reason"] else []
+    texts += [f"Intervals and further terms: {noise['intervals_by']}."] if noise.get("intervals_by") else []
     texts += [f"In doubt: {doubt}." for doubt in noise.get("doubts") or []]
     by_axis: dict[str, list[str]] = {}
     for axis, part in (noise["axes"] or {}).items():
@@ -116,12 +117,13 @@ def remarks(noise: JSON | None) -> list[str]:
 
 
 def _text(part: JSON | None) -> str:
-    """Return a value with its interval, or the upper limit."""
+    """Return a value with its interval if there is one, or the upper limit."""
     if part is None:
         return number(None)
     if part["value"] is None:
         return f"< {number(part['upper_limit'])}" if part.get("upper_limit") else number(None)
-    text = f"{number(part['value'])} ({number(part['interval'][0])} to {number(part['interval'][1])})"
+    text = number(part["value"])
+    text += " ({} to {})".format(*map(number, part["interval"])) if part["interval"] else ""
     for key, unit in (("correlation_time_s", "s"), ("frequency_hz", "Hz")):
         text += f", {number(part[key]['value'])} {unit}" if key in part else ""
     return text
