@@ -169,11 +169,12 @@ def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[Messag
     try:
         import_module(library)
     except ImportError as error:
+        package = library.partition(".")[0]
         raise IngestError(
-            f"reading {known.kind} needs the package {library.partition('.')[0]}, which is not installed ({error})",
+            f"reading {known.kind} needs the package {package}, which is not installed ({error})",
             str(path),
             code="missing_extra",
-            hint=f"pip install 'imu-calibration[{known.extra}]'",
+            hint=f"pip install 'imu-calibration[{known.extra}]'" if known.extra else f"pip install {package}",
         ) from error
     yield LogReader(path, known)
 

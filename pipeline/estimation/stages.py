@@ -71,7 +71,7 @@ class FitStage:
     needs: tuple[Change, ...] = ()  # what an earlier stage must have changed
     changes: tuple[Change, ...] = ()  # what it estimates or corrects
     accepts: tuple[Change, ...] = ()  # changes by stages of other modules that it uses, keeps or estimates anew
-    free: bool = False  # no equation of it fixes an element of bias and matrix: held-out errors are not the method's
+    free: bool = False  # estimates each element of bias and matrix freely; else the verdict may blame the method
     reference: bool = False  # the fit with which the diagnosis compares the other methods on a table
     known: Callable[[str, DataSheet], list[FittedEffect]] | None = None  # of a stage that changes the readings
 
@@ -126,6 +126,8 @@ def check_stages(sensor: str, stages: Sequence[str]) -> None:
     """
     for i, stage in enumerate(stages):
         found, module = declared(sensor, stage), stage_module(sensor, stage)
+        if "readings" in found.changes and found.known is None:
+            raise ConfigurationError(f"the stage {stage} changes the readings: declare in its FitStage what it knows")
         made = {change for before in stages[:i] for change in declared(sensor, before).changes}
         if lacking := [need for need in found.needs if need not in made]:
             raise ConfigurationError(

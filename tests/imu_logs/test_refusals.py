@@ -11,6 +11,7 @@ import pytest
 from sample_logs import SENSOR, make_recording, procedure, profile
 from unit_settings import ingest_of
 
+from imu_logs.files import SUFFIXES
 from pipeline.app.config.compose import check_ingest
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.ingest.files import recording_files
@@ -165,8 +166,7 @@ def test_missing_files_are_named_together_with_what_was_tried(tmp_path: Path, ca
     write_recording(tmp_path / "b.csv", make_recording())
     with pytest.raises(MissingInputError) as caught:
         read_recordings(procedure("a", "b", "c", optional=("d",)), ingest_of(canonical), SENSOR, tmp_path)
-    tried = "{0} (tried {0}.csv, .gcsv, .mcap, .bag, .db3, .ulg, .bin, .h5, .hdf5, .mat, .tlog, .tdms, .npy, .npz, "
-    tried += ".zip, .BIN)"
+    tried = "{0} (tried {0}" + ", ".join(SUFFIXES) + ")"
     assert caught.value.message == f"missing recordings: {tried.format('a')}; {tried.format('c')}"
     assert caught.value.file == str(tmp_path)
 

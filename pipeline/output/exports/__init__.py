@@ -9,8 +9,8 @@ and how ``convert`` reads it), and the text of the file in Jinja2. The text has 
     unit, document             name of the unit, its calibration
     sheets, gravity_g          figures of each sensor (``sensors.SensorFigures``); local gravity, g
 
-and the functions of ``sensors.TEMPLATE_FUNCTIONS``. The name of the template without ``.j2`` is the name of the format
-and, by default, of its file. Formats are listed nowhere else.
+the functions of ``sensors.TEMPLATE_FUNCTIONS``, and the filters ``comment``, ``json``, ``yaml``, ``numbers``. The name
+of the template without ``.j2`` is the name of the format and, by default, of its file.
 
 ``calibration.h`` has the effects as C expressions (``plan_of``). It performs the operations of
 ``pipeline.physics.compensation`` for one sample, in the same order. Double precision without fused operations and
