@@ -11,7 +11,16 @@ from bench_session import Session, record
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import draw
 from pipeline.app.one_unit import unit_of_recordings
-from pipeline.core.records import Agreement, Dependence, Note, Recording, SelectionErrors, SensorDiagnosis, StepErrors
+from pipeline.core.records import (
+    Agreement,
+    Dependence,
+    MovesError,
+    Note,
+    Recording,
+    SelectionErrors,
+    SensorDiagnosis,
+    StepErrors,
+)
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.stages import declared
 from pipeline.evaluation.diagnosis.diagnose import doubts_of, held_out_of
@@ -52,8 +61,18 @@ def held_out(after: float) -> SelectionErrors:
         (replace(NOTHING, published=ABOVE, free=INSIDE), "reference_in_doubt", "contradict each other"),
         (replace(BY_HAND, published=ABOVE), "reference_in_doubt", "held-out rests are of this unit"),
         (replace(BY_HAND, doubts=("face +x is 9.0 deg off",)), "reference_in_doubt", "reference: face +x"),
-        (replace(BY_HAND, moves=(2.9, 0.5)), "unexplained", "2.9 deg (rms); noise and stated uncertainties explain at"),
-        (replace(BY_HAND, moves=(2.9, 3.5)), "nothing_missing", ""),
+        (
+            replace(BY_HAND, moves=MovesError(2.9, 0.5)),
+            "unexplained",
+            "2.9 deg (rms); noise and stated uncertainties explain at",
+        ),
+        (replace(BY_HAND, moves=MovesError(2.9, 3.5)), "nothing_missing", ""),
+        (replace(BY_HAND, moves=MovesError(2.9, 3.5, 4.9)), "nothing_missing", ""),
+        (
+            replace(BY_HAND, moves=MovesError(2.9, 3.5, 5.1)),
+            "unexplained",
+            "direction of gravity by 5.1 times the noise",
+        ),
         (replace(NOTHING, published=ABOVE, over_noise=4.0), "unexplained", "4 times its noise"),
         (replace(NOTHING, published=BELOW), "floor_in_doubt", "estimate is too large"),
         (replace(NOTHING, static=ABOVE), "reference_in_doubt", "static"),

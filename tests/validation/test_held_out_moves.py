@@ -10,7 +10,7 @@ from hand_simulator import Hand, draw
 from unit_settings import with_noise
 
 from pipeline.app.one_unit import unit_of_recordings
-from pipeline.core.records import SENSORS
+from pipeline.core.records import SENSORS, MovesError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
@@ -31,8 +31,8 @@ def test_held_out_moves_beyond_noise_and_uncertainty_are_unexplained() -> None:
     verdicts = {}
     for name, recording in (("good", good), ("wrong", wrong)):
         moves = gravity_direction(*fits, [recording], noise, settings.procedure)
-        errors = moves["rms_deg"]["after"], moves["largest_expected_rms_deg"]
-        assert (errors[0] > errors[1]) == (name == "wrong")
+        errors = MovesError(moves["rms_deg"]["after"], moves["largest_expected_rms_deg"])
+        assert (errors.rms_deg > errors.largest_deg) == (name == "wrong")
         held = validate(fits[1], [good], noise, settings)
         said = diagnose(fits[1], [good], noise, settings, fits[0], validation=held, moves=errors)
         verdicts[name] = said["verdict"]

@@ -80,6 +80,7 @@ from pipeline.core.records.recording import (
 from pipeline.core.records.validation import (
     Agreement,
     LimitCheck,
+    MovesError,
     OverTemperature,
     SensorValidation,
     StepErrors,
@@ -128,6 +129,7 @@ __all__ = [
     "MethodError",
     "MonteCarlo",
     "Motion",
+    "MovesError",
     "Multiply",
     "NoMonteCarlo",
     "Noise",

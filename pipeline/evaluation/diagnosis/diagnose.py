@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import ConvergenceError, NotObservableError
-from pipeline.core.records import MATRIX, Noise, Recording, SensorCalibration, SensorDiagnosis, SensorValidation
+from pipeline.core.records import (
+    MATRIX,
+    MovesError,
+    Noise,
+    Recording,
+    SensorCalibration,
+    SensorDiagnosis,
+    SensorValidation,
+)
 from pipeline.core.settings import Uncertainty
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
@@ -63,7 +71,7 @@ def diagnose(
     *,
     validation: SensorValidation | None = None,
     gravity: SensorDiagnosis | None = None,
-    moves: tuple[float, float] | None = None,
+    moves: MovesError | None = None,
 ) -> SensorDiagnosis:
     """Return the diagnosis of a sensor.
 

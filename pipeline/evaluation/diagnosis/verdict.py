@@ -18,7 +18,7 @@ from pipeline.physics.effects.base import unit_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.core.records import Agreement, Dependence, SelectionErrors, SensorDiagnosis
+    from pipeline.core.records import Agreement, Dependence, MovesError, SelectionErrors, SensorDiagnosis
 
 EXPLAINED = 1.5  # times the noise: largest residual that is noise; it was 0.92 to 1.14 in 140 sensors without an effect
 # least share of the residual's excess that selected effects explain if the residual has another cause too
@@ -39,6 +39,8 @@ FAR_ABOVE_BY_HAND = 10.0  # times the noise: nobody sets down or holds a unit so
 # times the noise: a good hand scatters the directions of the published wearable by 5.1, scale factors that drift by
 # 1 to 3 % in a recording by 6.8 to 21
 MAX_SCATTER_BY_HAND = 6.0
+# times the noise: held-out moves of a published Xsens miss by 5.9 with its g-sensitivity left out, else by 1.7
+MAX_OVER_NOISE = 5.0
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
 STATIC_AGAIN = "record static again: ten minutes or more at rest, on a base that does not shake"
 SAME_SESSION = "record static in the session of the other recordings, without switching the unit off in between"
@@ -73,7 +75,7 @@ class VerdictInput:
     over_noise: float | None = None  # residual over the noise, of the fit without the selected effects
     left_over_noise: float | None = None  # the same with them
     published: HeldOutError | None = None  # of the unit's calibration
-    moves: tuple[float, float] | None = None  # rms error of held-out moves and its largest expected value, deg
+    moves: MovesError | None = None  # of held-out moves by hand
     scatter: float = 0.0  # of moves or directions by hand that the fit found, over the noise
     free: HeldOutError | None = (
         None  # of a free fit of the same recordings; filtered ones against the filtered reference
@@ -239,7 +241,8 @@ RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
     (Verdict.UNEXPLAINED, "above_as_the_residual", lambda e: e.above and e.at_noise is False),
     (Verdict.REFERENCE_IN_DOUBT, "contradiction", lambda e: e.above),
     (Verdict.UNEXPLAINED, "unexplained", lambda e: e.unexplained),
-    (Verdict.UNEXPLAINED, "moves", lambda e: e.moves and e.moves[0] > e.moves[1] and not e.missing),
+    (Verdict.UNEXPLAINED, "moves", lambda e: e.moves and e.moves.rms_deg > e.moves.largest_deg and not e.missing),
+    (Verdict.UNEXPLAINED, "far_moves", lambda e: e.moves and e.moves.over_noise > MAX_OVER_NOISE and not e.missing),
     (Verdict.UNEXPLAINED, "scatter", lambda e: e.scatter > MAX_SCATTER_BY_HAND and not e.missing),
     (Verdict.MISSING_EFFECT, "beyond", lambda e: e.missing),
     (Verdict.REFERENCE_IN_DOUBT, "disagreement", lambda e: e.disagrees),
