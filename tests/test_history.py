@@ -113,9 +113,9 @@ def test_a_run_that_drops_an_effect_is_told_with_what_it_cost_and_how_to_keep_it
         "U1, gyroscope: - g_sensitivity; held-out error of the magnitude 0.011 -> 0.12 deg/s, 12 times the noise floor",
         "U1: this run no longer has gyroscope.g_sensitivity, which run 2 had; to have it in every run:",
         f"  {add}",
-        f"2 units: 0 ready, 1 effect missing, 1 failed; look at {results}/index.html",
         "effect missing: U1; gyroscope: g sensitivity",
         f"  {add}",
+        f"2 units: 0 ready, 1 effect missing, 1 failed; look at {results}/index.html",
     ]
     assert len(outcome(results, SETTINGS, of_this_run=False).splitlines()) == len(told) - 3
 

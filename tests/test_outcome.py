@@ -140,4 +140,5 @@ def test_the_last_15_lines_name_each_unit_with_a_missing_effect_or_what_lists_th
     else:
         assert f"effect missing: {units} units; to list them:" in last
         assert f"  python -m pipeline explain fleet --all --results {tmp_path}" in last
-    assert last[-1].startswith("  python -m pipeline add fleet ")
+    assert last[-2].startswith("  python -m pipeline add fleet ")
+    assert last[-1].endswith("look at " + str(results / "index.html"))

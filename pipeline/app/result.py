@@ -15,6 +15,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.files import write_atomically
 from pipeline.core.pack import as_bytes
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Values
+from pipeline.core.verdicts import error_of
 from pipeline.ingest.axis_maps import in_body_axes, maps_of_log
 from pipeline.physics.compensation import Compensation, compensation_of
 from pipeline.unit import Task, UnitState, run_step
@@ -198,16 +199,16 @@ class UnitResult:
             lines.append(f"  bias {_row(part.bias)} {SENSOR_UNITS[sensor]}")
             lines += [f"  {'matrix' if i == 0 else '      '} {_row(row)}" for i, row in enumerate(part.matrix)]
             lines += [f"  effects {', '.join(part.effects)}"] if part.effects else []
-            lines.append(f"  held-out rms error {self._held_out(sensor)}")
+            lines.append(f"  held-out error {self._held_out(sensor)}")
         return "\n".join(line if len(line) <= WIDTH else f"{line[: WIDTH - 3]}..." for line in lines)
 
     def _held_out(self, sensor: str) -> str:
         held_out, unit = self.validation[sensor], SENSOR_UNITS[sensor]
         if not held_out or not held_out["held_out"]:
             return "not known: no held-out motion"
-        before, after = (held_out["steps"][i]["rms_error"] for i in (0, -1))
-        floor = held_out["noise_floor"]
-        return f"{before:.3g} -> {after:.3g} {unit}" + ("" if floor is None else f", noise floor {floor:.3g} {unit}")
+        error = error_of(held_out)
+        noise = f", {error.ratio:.3g} times the noise floor" if error.ratio else ""
+        return f"of the {error.kind} {error.before:.3g} -> {error.after:.3g} {unit}{noise}"
 
 
 def _row(values: Values) -> str:

@@ -38,7 +38,7 @@ def css_class(verdict: str | None) -> str:
     return Verdict(verdict).css_class if verdict in set(Verdict) else ""
 
 
-WITH_THEM = ", with which the largest U is "  # between open effects and the uncertainty, in summary.csv and sentences
+WITH_THEM = " (with which U of the "  # between open effects and the uncertainty, in summary.csv and sentences
 MARK_ABOVE_FLOORS = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good
 FAILED, INCOMPLETE, IMPLAUSIBLE, NOT_HELD_OUT = "failed", "incomplete", "implausible", "not_held_out"
 FAR, BEYOND_ACCEPTANCE, READY = "far_above_noise", "beyond_acceptance", "ready"
@@ -62,7 +62,7 @@ KINDS = {  # the most urgent first
     ),
     Verdict.MISSING_EFFECT: Kind("effect missing", "the model lacks an effect that the recordings show", "add it"),
     IMPLAUSIBLE: Kind(
-        "implausible", "a parameter is beyond four times the sensor file's limit",
+        "implausible", "a parameter is above four times the data sheet's limit",
         "check range, unit and columns, which the unit's page names",
     ),
     Verdict.REFERENCE_IN_DOUBT: Kind(
@@ -76,7 +76,7 @@ KINDS = {  # the most urgent first
         "noise in doubt", "the noise estimate may be too large, and hide an effect", "record static again"
     ),
     Verdict.LEFT_BY_METHOD: Kind(
-        "method leaves an error", "approximations of method or filter leave an error above the noise",
+        "method too coarse", "approximations of method or filter cause an error above the noise",
         "calibrate with a method that fits the full matrix (method=reference_least_squares)",
     ),
     FAR: Kind(
@@ -193,11 +193,14 @@ def _kinds(row: Mapping[str, Any], errors: Mapping[str, Error]) -> dict[str, lis
     return {kind: found[kind] for kind in KINDS if kind in found} if len(found) > 1 else found
 
 
-def problems(rows: Sequence[Mapping[str, Any] | RowState]) -> list[Problem]:
-    """Group the units of a campaign by what keeps them from being ready, the most urgent first."""
+def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False) -> list[Problem]:
+    """Group the units of a campaign by what keeps them from being ready, the most urgent first.
+
+    ``once``: each unit by its most urgent problem alone.
+    """
     groups: dict[tuple[str, tuple[str, ...]], list[tuple[float, str, str, list[str]]]] = {}
     for row, errors, kinds in map(state_of, rows):
-        for kind, sensors in kinds.items():
+        for kind, sensors in [*kinds.items()][: 1 if once else None]:
             effects: tuple[str, ...] = ()
             if kind == Verdict.MISSING_EFFECT:
                 names = [(s, (row.get(f"{s}_selected") or "").split(";")) for s in sensors]

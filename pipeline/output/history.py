@@ -6,12 +6,13 @@ the previous ones. A run that changes nothing writes no file.
 The state of a unit is::
 
     {"status", "error", "config_sha256", "config": {section: digest}, "recordings": {file: digest},
-     "overrides": {key: value}, "accelerometer": {"effects", "error", "floor", "verdict", "selected", "uncertainty"} or
-     null, "gyroscope": likewise}
+     "overrides": {key: value}, "accelerometer": {"effects", "error", "floor", "vector_error", "vector_floor",
+     "verdict", "selected", "uncertainty"} or null, "gyroscope": likewise}
 
-where ``error`` is the held-out rms error of the last step, ``floor`` its noise floor, in g or deg/s, and
-``uncertainty`` the largest expanded uncertainty of ``bias`` and ``matrix``. ``sections`` of an entry holds the values
-of each configuration section that no earlier entry contains, by digest.
+where ``error`` is the held-out rms error of the magnitude after the last step, ``floor`` its noise floor, in g or
+deg/s, ``vector_error`` and ``vector_floor`` the same of the vector, where the attitude is known, and ``uncertainty``
+the largest expanded uncertainty of ``bias`` and ``matrix``. ``sections`` of an entry holds the values of each
+configuration section that no earlier entry contains, by digest.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import numpy as np
 from imu_logs.units import SENSORS
 from pipeline.core.errors import InputError, shortened
 from pipeline.core.files import JSON, write_json
+from pipeline.core.verdicts import Error, error_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -103,16 +105,26 @@ def unit_state(
     for sensor in SENSORS:
         fitted = calibration.get(sensor)
         held_out, diagnosed = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
-        last = (held_out.get("steps") or [{}])[-1]
+        last, error = (held_out.get("steps") or [{}])[-1], error_of(held_out)
+        vector = {"vector_error": error.after, "vector_floor": error.floor} if error.kind == "vector" else {}
         state[sensor] = fitted and {
             "effects": [effect["name"] for effect in fitted.get("effects") or []],
             "error": last.get("rms_error"),
             "floor": held_out.get("noise_floor"),
+            **vector,
             "verdict": diagnosed.get("verdict"),
             "selected": diagnosed.get("selected") or [],
             "uncertainty": _largest(fitted.get("expanded_uncertainty") or {}),
         }
     return state
+
+
+def errors_of(states: Sequence[JSON], sensor: str) -> list[Error]:
+    """Return the error of a sensor in each of some states: of the vector if all have it, else of the magnitude."""
+    parts = [state.get(sensor) or {} for state in states]
+    vector = all(part.get("vector_error") for part in parts if part.get("error"))
+    kind, prefix = ("vector", "vector_") if vector else ("magnitude", "")
+    return [Error(kind, None, part.get(f"{prefix}error"), part.get(f"{prefix}floor")) for part in parts]
 
 
 def _digest(entry: JSON) -> str:

@@ -18,7 +18,7 @@ from imu_logs.units import SENSORS
 from pipeline.core.errors import shortened
 from pipeline.core.files import INSTALLED, JSON, read_json, text_of_cell
 from pipeline.core.verdicts import FAILED, KINDS, READY, SETTING, WITH_THEM, Verdict, problems, state_of
-from pipeline.output.history import difference, dropped, of_units, read_history
+from pipeline.output.history import difference, dropped, errors_of, of_units, read_history
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -37,6 +37,7 @@ SMALLEST_CHANGE = 0.02  # relative change of an error that is reported
 PLAIN_YAML_TEXT = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes in YAML, also within brackets
 NOT_TEXT = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}  # words that YAML reads as another type
 EFFECTS_OVERRIDE = re.compile(r"effects\.(accelerometer|gyroscope)=\[(.*)\]")
+OPEN = "effects that the recordings leave open (explain names them)"
 NOT_CONVERGED = "the fit did not converge: parameters and uncertainties are in doubt"
 DEFAULT_RESULTS = "results"  # the default folder of results
 
@@ -120,9 +121,9 @@ def all_well(rows: Sequence[Mapping[str, Any] | RowState]) -> str:
 
 
 def beyond_limits_groups(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
-    """Return the units with a parameter beyond the sensor file's limit, by sensor; ``rows``: of ``summary.csv``."""
+    """Return the units with a parameter outside the data sheet's limit, by sensor; ``rows``: of ``summary.csv``."""
     by_sensor = [(s, [row["unit"] for row in rows if row.get(f"{s}_beyond_limits")]) for s in SENSORS]
-    return [(f"{sensor}, beyond the sensor file's limits", units) for sensor, units in by_sensor if units]
+    return [(f"{sensor}, a parameter outside the data sheet's limits", units) for sensor, units in by_sensor if units]
 
 
 def place(verdict: str | None) -> int:
@@ -216,16 +217,16 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
             for (unit, run), effects in dropped(entries).items()
         ]
         lines += shortened(no_longer, NAMED_PER_LINE, "units that no longer have an effect")
-    found = problems(rows)
-    for problem in found:
+    found = problems(rows, once=True)
+    for problem in reversed(found):  # the most urgent next to the end
         if problem.kind not in (FAILED, Verdict.MISSING_EFFECT):
             lines += [problem_words(problem), f"  {command_of(problem, settings, folder)}"]
-    lines += [f"{counted(rows)}; look at {results}/index.html", *filter(None, [all_well(rows)])]
-    return "\n".join(lines + _missing(found, settings, folder)) + "\n"
+    lines += [*_missing(found, settings, folder), *filter(None, [all_well(rows)])]
+    return "\n".join([*lines, f"{counted(rows)}; look at {results}/index.html"]) + "\n"
 
 
 def _missing(found: Sequence[Problem], settings: Mapping[str, Any], results: str) -> list[str]:
-    """Return the last lines of a run: each unit with a missing effect, or how many there are and what lists them."""
+    """Return the lines before the last: each unit with a missing effect, or how many there are and what lists them."""
     missing = [problem for problem in found if problem.kind == Verdict.MISSING_EFFECT]
     units = {unit for problem in missing for unit in problem.units}
     if len(units) > NAMED_MISSING:
@@ -264,19 +265,15 @@ def _reasons(results: Path, units: Sequence[str]) -> list[str]:
 
 
 def _not_in_uncertainty(rows: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:
-    """Group the units by source of error that can exceed the expanded uncertainty U and is not part of it.
-
-    The size of U with open effects is that of the first unit.
-    """
-    groups: dict[tuple[str, str], list[str]] = {}
-    said: dict[tuple[str, str], str] = {}
-    for row in rows:
-        for sensor in SENSORS:
-            if source := row.get(f"{sensor}_not_in_uncertainty"):
-                key = sensor, source.partition(WITH_THEM)[0]
-                groups.setdefault(key, []).append(row["unit"])
-                said.setdefault(key, f"{sensor}, U does not include {source}")
-    return {said[key]: units for key, units in groups.items()}
+    """Group the units by source of error that can exceed the expanded uncertainty U and is not part of it."""
+    groups: dict[str, list[str]] = {}
+    for sensor in SENSORS:
+        for row in rows:
+            for source in (row.get(f"{sensor}_not_in_uncertainty") or "").split("; "):
+                said = OPEN if WITH_THEM in source and len(rows) > 1 else source
+                if source:
+                    groups.setdefault(f"{sensor}, U does not include {said}", []).append(row["unit"])
+    return groups
 
 
 def _changes(entries: Sequence[JSON]) -> list[str]:
@@ -287,16 +284,15 @@ def _changes(entries: Sequence[JSON]) -> list[str]:
         before, after = [{}, *(state for _, state in states[unit])][-2:]
         change = difference(before, after)
         for sensor in SENSORS:
-            errors = [float((state.get(sensor) or {}).get("error") or 0.0) for state in (before, after)]
-            if not all(errors):
+            was, now = errors_of((before, after), sensor)
+            if not was.after or not now.after:
                 continue
-            factor = abs(math.log(errors[1] / errors[0]))
+            factor = abs(math.log(now.after / was.after))
             if factor < SMALLEST_CHANGE and not change.added[sensor] and not change.removed[sensor]:
                 continue
             words = ", ".join(change.words(sensor)).replace("\N{MINUS SIGN}", "-").replace("\N{RIGHTWARDS ARROW}", "->")
-            floor = after[sensor].get("floor")
-            ratio = f", {errors[1] / floor:.3g} times the noise floor" if floor else ""
-            line = f"held-out error of the magnitude {errors[0]:.3g} -> {errors[1]:.3g} {SENSOR_UNITS[sensor]}{ratio}"
+            ratio = f", {now.ratio:.3g} times the noise floor" if now.ratio else ""
+            line = f"held-out error of the {now.kind} {was.after:.3g} -> {now.after:.3g} {SENSOR_UNITS[sensor]}{ratio}"
             uncertainty = uncertainty_words(before[sensor], after[sensor], SENSOR_UNITS[sensor])
             line += f"\n  {uncertainty}" if uncertainty else ""
             lines.append((factor, f"{unit}, {sensor}: {words}; {line}"))

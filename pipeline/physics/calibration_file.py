@@ -12,11 +12,11 @@ where
     P : (3, 3) symmetric, ``(K K^T)^(1/2)``: scale factors on its diagonal, cross-axis sensitivities off it
     R : (3, 3) rotation, of the unit against the table or its case: no property of the sensor
 
-A parameter p with the expanded uncertainty U and the sensor file's limit L is implausible where
+A parameter p with the expanded uncertainty U and the data sheet's limit L is implausible where
 
     |p| - 2 U > max(4 L, F)
 
-and beyond the sensor file's limit where ``|p| > L``: one list, ``beyond_limits``, which the run stores and all pages,
+and outside the data sheet's limit where ``|p| > L``: one list, ``beyond_limits``, which the run stores and all pages,
 the summary, the certificate and the terminal show.
 
 A data sheet states L as a bound, or as one standard deviation. Four of these are exceeded by a good sensor's 12
@@ -280,8 +280,8 @@ NAMED_PARAMETERS = 5  # parameters beyond the limits that a line names
 RANGE_RATIOS = [2.0**n for n in range(-6, 7) if n]  # ratios of the ranges of one sensor: neighbours differ by two
 CAUSES_OF_BIAS = "an offset of raw counts that is not subtracted, another column, or a damaged axis"
 OF_CROSS_AXIS = "another column or axis map, or a unit that moved on the table between recordings"
-OF_FRAME = "the direction of the case"
-NO_FRAME = "how it lies in the body frame of turn axes, faces and zeros is not stated (table.seat_deg, procedure.faces)"
+OF_FRAME = "the angles between the calibrated axes and the case"
+NO_FRAME = "how the case lies to turn axes, faces and zeros is not stated (table.seat_deg, procedure.faces)"
 OF_EFFECT = "another effect that looks alike, or an error of the table, its log or the time stamps"
 
 Entry = dict[str, Any]
@@ -291,7 +291,7 @@ LimitRow = tuple[
 
 
 def implausible(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[Entry]:
-    """Return the fitted parameters of a sensor that are beyond the sensor file's limits, the largest ratio first.
+    """Return the fitted parameters of a sensor that are outside the data sheet's limits, the largest ratio first.
 
     ``part`` is the sensor's part of ``calibrations/<unit>.json``, ``data_sheet`` the figures of the sensor. An
     entry has ``parameter``, ``value``, ``unit``, ``limit`` of the sensor file, ``ratio`` of the two and
@@ -306,7 +306,7 @@ def implausible(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> 
 
 
 def beyond_limits(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[Entry]:
-    """Return the fitted parameters whose absolute value exceeds the sensor file's limit, the largest ratio first.
+    """Return the fitted parameters whose absolute value exceeds the data sheet's limit, the largest ratio first.
 
     Parameters as of ``implausible``; an entry has ``parameter``, ``value``, ``unit``, ``limit`` and ``ratio``.
     """
@@ -395,7 +395,7 @@ def sentences(sensor: str, part: Mapping[str, Any] | None) -> list[str]:
         unit = "" if worst["unit"] == "1" else f" {worst['unit']}"
         found.append(
             f"Implausible for this model of {sensor}: {names}; {_plain(worst)} is {worst['value']:+.4g}{unit}, "
-            f"{worst['ratio']:.3g} times the sensor file's limit of {worst['limit']:.4g}{unit}. Likely cause: {cause}. "
+            f"{worst['ratio']:.3g} times the data sheet's limit of {worst['limit']:.4g}{unit}. Likely cause: {cause}. "
             f"Where it is meant so: sensor.{sensor}.accept_implausible=true."
         )
     return found
@@ -432,7 +432,7 @@ def frame_words(part: Mapping[str, Any] | None) -> str:
     """Return how well the body frame of a sensor is known against the case; empty where nothing is stated."""
     frame = (part or {}).get("frame_deg")
     sizes = frame and ", ".join(f"{u:.2g}" for u in frame)
-    return f"The body frame is known against the case to {sizes} deg about x, y, z (95 %)" if sizes else ""
+    return f"The calibrated axes are known against the case to {sizes} deg about x, y, z (95 %)" if sizes else ""
 
 
 def not_determined(part: Mapping[str, Any]) -> str:

@@ -114,10 +114,10 @@ def open_words(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     both = both_figures(part)
     if part is None or not both:
         return []
-    figures = []
+    figures: list[str] = []
     for kind, unit in (("bias", f" {part['unit']}"), ("matrix", "")):
         U, wide = np.max([pair for name, pair in both.items() if name.startswith(kind)] or [(0.0, 0.0)], axis=0)
-        figures += [f"{wide:.2g}{unit} of {kind} (without {U:.2g})"] if wide else []
+        figures += [f"{kind} is up to {wide:.2g}{unit} in place of {U:.2g}"] if wide else []
     names = [entry["effect"].replace("_", " ").replace(".", ": ") for entry in part["open"]]
-    source = f"{', '.join(shortened(names, NAMED_EFFECTS))}{WITH_THEM}{', '.join(figures)}"
+    source = f"{', '.join(shortened(names, NAMED_EFFECTS))}{WITH_THEM}{', of the '.join(figures)})"
     return [(source, "these recordings leave them open, and U is valid if they are absent")]

@@ -52,6 +52,7 @@ FORMATS = ("csv", "mcap")
 DESCRIPTION_KINDS = ("rows", "file", "program")
 _, BY_FILE, BY_PROGRAM = DESCRIPTION_KINDS
 UNITS_OF_A_LOT = 25  # for units that are described by a count: a round number
+SAMPLING_BY_HAND_S = 0.1  # docs/record.md: 10 Hz or more, to find rests
 # By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
 COURSE_BY_HAND = Course(dwell_s=REST_BY_HAND_S, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
 # Each turn there and back, the second held out between rests of 4 s or longer; 360 deg in some 3 s.
@@ -253,7 +254,13 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--table", metavar="NAME", help="configs/table (acutronic; hand for procedures without a table)")
     add("--procedure", metavar="NAME", help="configs/procedure (three_axis_turns)")
     add("--samples", type=int, metavar="N", help="approximate rows of a unit; scales rests and held-out motion")
-    add("--interval", dest="interval_s", type=float, metavar="S", help="sampling interval in s (0.12)")
+    add(
+        "--interval",
+        dest="interval_s",
+        type=float,
+        metavar="S",
+        help="sampling interval in s (0.12; by hand 0.1)",
+    )
     add("--table-log", choices=DESCRIPTION_KINDS,
         help="where the table is logged: in the sensor's rows (the default), in a file with a separate clock, or not "
         "at all: then its program is known")  # fmt: skip
@@ -282,7 +289,8 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
 def described(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keys of a unit of ``simulation.yaml`` from the parsed options; other options are ignored."""
     procedure = arguments.get("procedure", "three_axis_turns")
-    unit: dict[str, Any] = {"table": "acutronic" if procedure in TABLE_PROCEDURES else "hand"}
+    by_hand = {"table": "hand", "interval_s": SAMPLING_BY_HAND_S}
+    unit: dict[str, Any] = {"table": "acutronic"} if procedure in TABLE_PROCEDURES else by_hand
     unit |= {name: arguments[name] for name in RECORDED if name in arguments}
     unit |= {"table_log": {"kind": arguments["table_log"]}} if "table_log" in arguments else {}
     course = {f.name: arguments[f.name] for f in fields(Course) if f.name in arguments}

@@ -68,7 +68,7 @@ def test_a_parameter_beyond_the_data_sheet_is_told(results: Path, capsys: pytest
     entry = {"parameter": "bias_x", "value": 90.0, "unit": "deg/s", "limit": 20.0, "ratio": 4.5, "likely_cause": "dust"}
     (folder / "U1.json").write_text(json.dumps({"accelerometer": None, "gyroscope": {"implausible": [entry]}}))
     main([str(results / "bench"), "U1"])
-    said = "bias x is +90 deg/s, 4.5 times the sensor file's limit of 20 deg/s. Likely cause: dust."
+    said = "bias x is +90 deg/s, 4.5 times the data sheet's limit of 20 deg/s. Likely cause: dust."
     assert said in unwrapped(capsys.readouterr().out)
 
 

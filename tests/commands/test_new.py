@@ -1,5 +1,6 @@
 """An empty campaign: it names the table whose accuracy it takes, sets other ranges, and says how to record."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,16 @@ def test_the_readme_says_how_to_mount_and_record_and_what_stays_unseen(tmp_path:
             ["--procedure", "multi_position"],
             ["python -m pipeline guide raw/U1/recording.csv --follow", "one of 3 rests"],
         ),
-        (["--procedure", "ferraris"], ["six faces", "one of 2 turns about an axis is held out"]),
+        (
+            ["--procedure", "ferraris"],
+            [
+                "by hand, ferraris",
+                "six faces",
+                "one of 2 turns about an axis is held out",
+                "No missing effect would show",
+            ],
+        ),
+        (["--procedure", "listed"], ["| `label` | any text |", "judge.csv,turn,z,360,1,yes", "check --campaign ."]),
         (["--procedure", "six_positions"], ["nothing is held out"]),
         (["--table", "single_axis"], ["Mount the unit anew for each turn axis, to 2 deg", "askew on the turn axis"]),
         (["--table", "mark2"], ["does not log its motion"]),
@@ -95,6 +105,7 @@ def test_each_bench_gets_its_own_instructions(tmp_path: Path, options: list[str]
     assert main([str(tmp_path / "bench"), *options]) == 0
     text = (tmp_path / "bench" / "README.md").read_text()
     assert all(words in text for words in said)
+    assert not re.search(r"\|---\|\n(?!\|)", text)  # no table is empty
     load_campaign({"campaign": str(tmp_path / "bench")})
 
 

@@ -50,7 +50,7 @@ SAME_MEANING = {
 
 # Names that still have several meanings.
 NOT_YET = {
-    "COMMANDS", "Error", "FAILED", "INCOMPLETE", "KINDS", "Kind", "LETTERS", "LISTED", "MOVING", "NARROWEST",
+    "COMMANDS", "Error", "FAILED", "INCOMPLETE", "KINDS", "Kind", "LETTERS", "MOVING", "NARROWEST",
     "LEAST_TURN_DEG", "OF_THE_BIAS", "Problem", "RESTING", "ROW_S", "SHEET", "WHOLE",
 }  # fmt: skip
 

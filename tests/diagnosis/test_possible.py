@@ -56,7 +56,7 @@ def test_an_effect_beyond_three_times_its_limit_is_no_cause(factor: float, *, po
     if possible:
         assert found is before
     else:
-        assert_no_cause(found, "bias_temperature", "3.2 times the sensor file's limit")
+        assert_no_cause(found, "bias_temperature", "3.2 times the data sheet's limit")
 
 
 def test_an_interval_that_reaches_three_times_the_limit_is_possible() -> None:

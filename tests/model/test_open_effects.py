@@ -81,7 +81,7 @@ def test_both_figures_are_said_where_they_differ_by_more_than_ten_percent() -> N
     assert set(both_figures(part)) >= {"bias_x", "bias_y", "bias_z"}
     ((source, reason),) = open_words(part)
     assert "cubic nonlinearity" in source
-    assert f"(without {U_BIAS:.2g})" in source
+    assert f"in place of {U_BIAS:.2g}" in source
     assert "if they are absent" in reason
     assert open_words({**part, "uncertainty_with_open": part["expanded_uncertainty"]}) == []
     assert open_words({k: v for k, v in part.items() if k != "uncertainty_with_open"}) == []  # of an older version

@@ -37,12 +37,12 @@ def test_the_fall_stands_beside_what_was_added_and_a_rise_beside_what_was_remove
     drawn = texts(page)
     assert [t for t in drawn if t.startswith("run")] == ["run 1, 12.6 × floor", "run 2: + g sensitivity, 1.07 × floor"]
     assert {"0.126", "0.0107", "noise floor 0.0100"} <= set(drawn)
-    assert "the held-out error falls from 0.126 to 0.0107 deg/s, 1.07 × the noise floor" in page
+    assert "the error of the magnitude falls from 0.126 to 0.0107 deg/s, 1.07 × the noise floor" in page
     assert "no longer has" not in page
 
     page = with_history(MARK, [*states, (5, state([], 0.126))], TIMES)
     assert "The last run no longer has g sensitivity, which run 2 had." in page
-    assert "the held-out error rises from 0.0107 to 0.126 deg/s" in page
+    assert "the error of the magnitude rises from 0.0107 to 0.126 deg/s" in page
     assert "Run 5, 2026-02-07 04:05 UTC: − gyroscope.g_sensitivity" in page
 
 

@@ -200,7 +200,7 @@ def test_parameters_beyond_the_data_sheet_are_shown_on_both_pages_and_in_the_sum
     page = Text(campaign_page.render("bench", [row], []))
     assert "1 sensor with implausible parameters" in page.text
     assert "U , gyroscope: scale factor x" in page.text
-    assert "beyond the sensor file's limits" not in Text(campaign_page.render("bench", rows(unit, 2), [])).text
+    assert "outside the data sheet's limits" not in Text(campaign_page.render("bench", rows(unit, 2), [])).text
 
 
 def test_every_place_counts_the_same_units_beyond_the_sensor_files_limits(unit: Unit, tmp_path: Path) -> None:
@@ -225,24 +225,24 @@ def test_every_place_counts_the_same_units_beyond_the_sensor_files_limits(unit: 
     assert [row["unit"] for row in read if row["accelerometer_beyond_limits"]] == counted
     fitted = parameter_table({name: unit_parameters(c, sensor) for name, c in found.items()})
     index = Text(campaign_page.render("bench", summaries, [], parameters=fitted)).text
-    assert "Beyond the sensor file's limits : accelerometer of 2 units ( biased , skew )" in index
+    assert "Outside the data sheet's limits : accelerometer of 2 units ( biased , skew )" in index
     (chart_of_units, _), _ = campaign_page.strips(summaries, fitted)
-    assert "2 of 4 units are beyond the sensor file's limits; farthest: skew" in chart_of_units.finding
+    assert "2 of 4 units are outside the data sheet's limits; farthest: skew" in chart_of_units.finding
     told = outcome(folder, {}, of_this_run=False)
-    assert "accelerometer, beyond the sensor file's limits: biased, skew\n" in told
+    assert "accelerometer, a parameter outside the data sheet's limits: biased, skew\n" in told
     for name, document in found.items():
         page = Text(render(document, unit.validation, unit.diagnosis, [], settings)).text
         report = certificate(document, unit.validation, settings, None)
         explained = explain(folder, {name: unit.diagnosis | {"unit": name}}, {})
         if name in counted:
-            assert f"Beyond the sensor file's limits : {words[name]}." in page.partition(": why")[0]
-            assert page.count("beyond it") == 1
-            assert f"Accelerometer, beyond the sensor file's limits: {words[name]}." in explained
+            assert f"Outside the data sheet's limits : {words[name]}." in page.partition(": why")[0]
+            assert page.count("outside it") == 1
+            assert f"Accelerometer, outside the data sheet's limits: {words[name]}." in explained
             assert len(report["measurementResults"][0]["beyondLimits"]) == 1
-            assert "Beyond the sensor file's limits" in Text(certificate_page(name, report)).text
+            assert "Outside the data sheet's limits" in Text(certificate_page(name, report)).text
         else:
-            assert "eyond the sensor file's limits" not in page + explained + certificate_page(name, report)
-            assert "beyond it" not in page
+            assert "utside the data sheet's limits" not in page + explained + certificate_page(name, report)
+            assert "outside it" not in page
 
 
 def test_a_page_states_one_uncertainty_of_a_parameter(unit: Unit) -> None:

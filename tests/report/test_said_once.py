@@ -14,16 +14,20 @@ from pipeline.core.verdicts import error_in_row, error_of, kinds_of, problems
 from pipeline.evaluation import diagnosis as diagnosis_package
 from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.output import pages as report_package
-from pipeline.output.outcome import counted
+from pipeline.output.history import errors_of, of_units, record, unit_state
+from pipeline.output.outcome import changes_of, counted
 from pipeline.output.pages import campaign_page
 from pipeline.output.pages.chart import Figure
 from pipeline.output.pages.diagnosis_section import limit_rows
 from pipeline.output.pages.group_charts import Point, bars
 from pipeline.output.pages.parameters import summary_row
+from pipeline.output.pages.run_section import MARK, runs_data, times_of, with_history
 from pipeline.output.pages.unit_page import render
 
 from .conftest import SHEET, Unit, build_unit
 from .test_pages import Text
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +61,42 @@ def test_the_error_has_one_value_on_page_index_summary_and_terminal(known: Unit,
     told = explain(tmp_path, {"U1": known.diagnosis | {"unit": "U1"}}, {})
     assert "The error of the vector on held-out motion is 0.0265 g, 5.3 times the noise floor." in told
     assert "0.0031 g" not in told
+
+
+def test_the_error_of_the_runs_is_the_one_of_page_and_index(known: Unit, tmp_path: Path) -> None:
+    before = unit_state(known.calibration, known.validation, known.diagnosis, {})
+    better = copy.deepcopy(known.validation)
+    better["accelerometer"]["steps"][-1] |= {"rms_error": 0.003, "vector_rms_error": 0.0051}
+    after = unit_state(known.calibration, better, known.diagnosis, {"effects.accelerometer": "[x]"})
+    after["accelerometer"]["effects"] = ["quadratic_nonlinearity"]
+    for state in (before, after):
+        entries = record(tmp_path, {"U1": state}, {"campaign": "bench"})
+    (line,) = changes_of(tmp_path, ["U1"])
+    said = "held-out error of the vector 0.0265 -> 0.0051 g, 1.02 times the noise floor"
+    assert line.startswith(f"U1, accelerometer: + quadratic_nonlinearity; {said}")
+    page = with_history(MARK, of_units(entries)["U1"], times_of(entries))
+    assert "the error of the vector falls from 0.0265 to 0.00510 g, 1.02 × the noise floor" in page
+    (unit,) = (runs_data(entries, {}) or {})["units"]
+    assert [state["accelerometer"][:2] for _, state in unit[1]] == [[0.0265, 0.005], [0.0051, 0.005]]
+    of_version_before = copy.deepcopy(before)
+    del of_version_before["accelerometer"]["vector_error"]
+    kinds = [error.kind for error in errors_of([of_version_before, after], "accelerometer")]
+    assert kinds == ["magnitude"] * 2
+
+
+def test_the_terminal_names_a_unit_once_and_an_action(known: Unit) -> None:
+    row = summary_row("U1", known.calibration, known.validation, known.diagnosis, {})
+    row |= {"accelerometer_verdict": "not_enough_data", "gyroscope_verdict": "unexplained", "pass": "False"}
+    assert len(problems([row])) == 4
+    assert [(p.kind, p.units) for p in problems([row], once=True)] == [("unexplained", ["U1"])]
+
+
+def test_figures_of_the_readme_agree() -> None:
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    stated = re.findall(r"(\d[\d.]*) deg/s, (\d[\d.]*) times the noise floor\b", readme)
+    ((before, after),) = re.findall(r"error of the vector (\S+) -> (\S+) deg/s", readme)
+    assert {stated[0], stated[1]} == {(before, stated[0][1])}
+    assert stated[2][0] == after
 
 
 def test_units_are_counted_once_by_their_most_urgent_problem() -> None:

@@ -72,7 +72,7 @@ def test_each_dot_stands_at_its_share_of_the_limit_and_tells_its_value() -> None
         limit = float(text.rpartition("±")[2])
         assert 100.0 * value / limit == pytest.approx(abs(true), rel=2e-3)
     beyond = (np.abs(np.delete(shares, 2, 0)) > 1.0).any(axis=1).sum()
-    assert f"{beyond} of 6 units are beyond the sensor file's limits" in figure.finding
+    assert f"{beyond} of 6 units are outside the data sheet's limits" in figure.finding
 
 
 def test_of_many_units_the_farthest_are_drawn() -> None:

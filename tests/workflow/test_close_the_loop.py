@@ -60,7 +60,7 @@ class Loop:
         """Keep what a run has said and left."""
         part = json.loads((self.results / "validations" / f"{HIDDEN}.json").read_text())["gyroscope"]
         self.said[when] = said
-        self.errors[when] = part["steps"][-1]["rms_error"], part["noise_floor"]
+        self.errors[when] = part["steps"][-1]["vector_rms_error"], part["vector_noise_floor"]
         files = [
             f for f in self.results.rglob("*") if f.is_file() and f.relative_to(self.results).parts[0] != "batches"
         ]
@@ -112,10 +112,10 @@ def test_the_run_its_repetition_explain_and_the_page_show_the_same_command(loop:
     command = f"python -m pipeline add 'my demo' {HIDDEN} gyroscope.g_sensitivity"
     assert loop.said["page"] == command
     for when in ("first", "again"):
-        *_, counts, missing, last = loop.said[when].rstrip().splitlines()
+        *_, missing, shown, counts = loop.said[when].rstrip().splitlines()
         assert counts == "2 units: 1 ready, 1 effect missing, 0 failed; look at results/my demo/index.html"
         assert re.fullmatch(rf"effect missing: {HIDDEN}; gyroscope: g sensitivity; [\d.]+ x noise", missing)
-        assert last == f"  {command}"
+        assert shown == f"  {command}"
     lines = [line.strip() for line in loop.said["explain"].splitlines()]
     assert lines[:2] == [HIDDEN, "gyroscope"]
     assert lines[lines.index("To add it:") + 1] == command
@@ -132,8 +132,11 @@ def test_the_held_out_error_falls_to_its_floor_and_the_other_unit_stays(loop: Lo
     assert f"diagnose: {OTHER} unchanged, taken from the last run\n" in loop.said["diagnose"]
     assert f"diagnose: {HIDDEN} unchanged" not in loop.said["diagnose"]
     assert "missing:" not in loop.said["added"]
-    told = f"{HIDDEN}, gyroscope: + g_sensitivity; held-out error of the magnitude {before:.3g} -> {after:.3g} deg/s, "
-    assert told + f"{after / floor_after:.3g} times the noise floor\n" in loop.said["added"]
+    told = f"{HIDDEN}, gyroscope: + g_sensitivity; held-out error of the vector {before:.3g} -> {after:.3g} deg/s, "
+    told += f"{after / floor_after:.3g} times the noise floor"
+    assert told + "\n" in loop.said["added"]
+    assert told in (ROOT / "README.md").read_text()
+    assert f"motion is {before:.3g} deg/s, {before / floor:.3g} times" in " ".join(loop.said["explain"].split())
     assert re.search(r"largest expanded uncertainty \(95 %\): .*matrix [\d.]+ -> [\d.]+ %\n", loop.said["added"])
 
 
@@ -148,7 +151,7 @@ def test_the_history_draws_the_fall_with_what_was_added(loop: Loop) -> None:
     assert drawn[second + 1].startswith("noise floor ")  # then the values of the bars, above the line of the floor
     values = [float(t) for t in drawn[second + 2 : second + 4]]
     assert values == pytest.approx([loop.errors["first"][0], loop.errors["added"][0]], rel=0.005)
-    assert "error falls from" in section
+    assert "error of the vector falls from" in section
 
 
 def test_removing_undoes_it_and_says_what_the_run_no_longer_has(loop: Loop) -> None:

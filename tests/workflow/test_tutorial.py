@@ -141,8 +141,8 @@ def test_the_table_of_runs_is_that_of_the_history(page: str, typed: Typed) -> No
     runs = []
     for file in sorted((typed.directory / "results" / "tutorial" / "history").iterdir()):
         part = typed.content(str(file.relative_to(typed.directory)))["units"]["bench-7"]["gyroscope"]
-        effects, ratio = ",".join(part["effects"]) or "none", str(part["error"] / part["floor"])
-        runs.append((effects, str(part["error"]), ratio, part["verdict"]))
+        effects, ratio = ",".join(part["effects"]) or "none", str(part["vector_error"] / part["vector_floor"])
+        runs.append((effects, str(part["vector_error"]), ratio, part["verdict"]))
     rows = table(page, "effects of the gyroscope")
     assert len(rows) == len(runs) == 3
     for row, run in zip(rows, runs, strict=True):

@@ -135,10 +135,10 @@ def overview(folder: Path, rows: Sequence[Mapping[str, Any]], width: int, *, who
 
     ``rows``: of ``summary.csv``; ``whole``: every problem with every unit, in any number of rows.
     """
-    settings, found = _settings(folder), problems(rows)
+    settings, found = _settings(folder), problems(rows, once=not whole)
     head = [*filter(None, [f"{folder.name}, {counted(rows)}", all_well(rows)])]
     limits = [
-        f"Beyond the sensor file's limits: {what.partition(',')[0]} of {len(units)} unit{'s' * (len(units) != 1)}"
+        f"Outside the data sheet's limits: {what.partition(',')[0]} of {len(units)} unit{'s' * (len(units) != 1)}"
         + f" ({', '.join(units)})" * whole
         for what, units in beyond_limits_groups(rows)
     ]
@@ -223,7 +223,7 @@ def explain(
             "notes": [
                 *(line for s in SENSORS for line in sentences(s, calibration.get(s))),
                 *(
-                    f"{s.capitalize()}, beyond the sensor file's limits: {names}."
+                    f"{s.capitalize()}, outside the data sheet's limits: {names}."
                     for s in SENSORS
                     if (names := beyond_words(calibration.get(s)))
                 ),

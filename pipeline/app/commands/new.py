@@ -15,7 +15,7 @@ from pipeline.ingest.recordings_sheet import EXAMPLE
 from pipeline.output.outcome import run_command
 from pipeline.output.pages.pages import template
 from pipeline.physics.sensor_file import settings_of_ranges
-from pipeline.simulation.description import UnitDescription, read_option, shipped_settings
+from pipeline.simulation.description import UnitDescription, described, read_option, shipped_settings
 from pipeline.simulation.procedures import TABLE_PROCEDURES
 
 if TYPE_CHECKING:
@@ -24,12 +24,6 @@ if TYPE_CHECKING:
     from pipeline.core.settings import DataSheet, Table
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
-LISTED = """\
-# Recordings that a sheet lists
-
-Put the recordings of a unit into `raw/{0}` and write a row for each into `raw/{0}/recordings.csv`: what it holds, and
-for a turn its axis and angle. docs/recordings.md has a row for each case, and states what it determines.
-"""
 HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"
 EPILOG = """\
 On a terminal the command asks for the sensor, the ranges, the procedure and the table that no option states.
@@ -67,9 +61,14 @@ def main(argv: Sequence[str]) -> int:
             f"procedure {procedure_name} does not fit table {table_name}: {known} need a table, the others need none "
             "(table hand); docs/record.md shows both"
         )
-    unit = UnitDescription(arguments.unit, sensor=sensor_name, table=table_name, procedure=procedure_name)
+    bench = described({"sensor": sensor_name, "table": table_name, "procedure": procedure_name})
+    unit = UnitDescription(arguments.unit, **bench)
     sheet = procedure.get("sheet")
-    text = LISTED.format(arguments.unit) if sheet else readme(unit, arguments.directory.resolve().name)
+    text = (
+        template("listed_readme.md").render(unit=arguments.unit)
+        if sheet
+        else readme(unit, arguments.directory.resolve().name)
+    )
     if ranges != _ranges_of(data_sheets):
         text += "\nThe sizes apply to the ranges in the sensor file; campaign.yaml states the ranges of this bench.\n"
     folder = arguments.directory / procedure["folder"].replace("{unit}", arguments.unit)

@@ -59,7 +59,7 @@ def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
     limits = parameter_limits(this, case.sensor, sheet.effects)
     if len(limits) == len(values) and not sheet.accept_implausible and not possible(values, u, limits):
         ratio = float(np.max(np.abs(values) / limits))
-        return f"it would be {ratio:.3g} times the sensor file's limit, and beyond {TIMES_POSSIBLE:g} times it"
+        return f"it would be {ratio:.3g} times the data sheet's limit; at most {TIMES_POSSIBLE:g} times is possible"
     if entry.effect == EARTH and np.linalg.norm(values) - 2.0 * float(np.max(u)) > EARTH_RATE_DPS:
         return f"{np.linalg.norm(values):.2g} deg/s is more than the Earth turns ({EARTH_RATE_DPS:.2g} deg/s)"
     if "temperature" in this.needs:

@@ -1,6 +1,6 @@
 """The page of a campaign: failures first, then every unit, the fleet in charts, comparisons and statistics.
 
-Strip plots show fitted parameters as a share of the sensor file's limit, ``value / limit``, with one dot for each of
+Strip plots show fitted parameters as a share of the data sheet's limit, ``value / limit``, with one dot for each of
 the siblings: units of one sensor model that were calibrated by one method. A row is a parameter of the measurement:
 bias, error of a scale factor, or cross-axis sensitivity. Which are beyond the limit is counted by the calibrations.
 """
@@ -70,6 +70,9 @@ def render(
     frame = pd.DataFrame(rows).reindex(
         columns=list(dict.fromkeys([*SUMMARY_COLUMNS, *(k for row in rows for k in row)]))
     )
+    for sensor in SENSORS:  # the error that the page states, in place of that of the magnitude
+        for column, figure in (("error_before", "before"), ("error_after", "after"), ("noise_floor", "floor")):
+            frame[f"{sensor}_{column}"] = [getattr(state.errors[sensor], figure) for state in states]
     judged = [row.get("pass") for row in rows]
     serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
     fleet = [unit_chart for sensor in SENSORS if (unit_chart := _fleet_figure(sensor, frame))]
@@ -371,7 +374,7 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
     )
     figure = Figure(name, finding, caption, tuple(legend))
     panel = Panel([*layers, *dots], "", ROW * len(labels), limits=(0.4, height[0] + 0.6), rows=labels[::-1])
-    label = "share of the sensor file's limit, %"
+    label = "share of the data sheet's limit, %"
     return chart(figure, description, [panel], label, margin=0.03, left=LEFT, units="units"), values
 
 

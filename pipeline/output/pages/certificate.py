@@ -195,6 +195,7 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: Settings, 
         "beforeAdjustment": {k: first.get(k) for k in CERTIFIED_ERRORS} if first else None,
         "afterAdjustment": {k: last.get(k) for k in CERTIFIED_ERRORS} if last else None,
         "noiseFloor": held_out.get("noise_floor"),
+        "vectorNoiseFloor": held_out.get("vector_noise_floor"),
         "residualsOverTemperature": held_out.get("over_temperature"),
         "conformity": {
             **stated.conformity.json_value,
@@ -213,7 +214,13 @@ def model_state(held_out: JSON | None, found: JSON | None) -> JSON:
         said = "complete as far as the recordings show"
     ratio = f"error of the {error.kind} {number(error.ratio)} × noise" if error.ratio else ""
     sentence = "; ".join(filter(None, [said or "not diagnosed", ratio]))
-    return {"verdict": verdict, "notModelled": missing, "errorOverNoise": error.ratio, "sentence": sentence}
+    return {
+        "verdict": verdict,
+        "notModelled": missing,
+        "error": error.kind,
+        "errorOverNoise": error.ratio,
+        "sentence": sentence,
+    }
 
 
 def _supplied(calibration: JSON, sensor: str, held_out: JSON) -> str:

@@ -20,7 +20,8 @@ of the held-out samples. The noise sigma of N held-out samples makes their rms e
     u(e)^2 = sigma^2 (2 e^2 - sigma^2) / (2 N e^2),
 
 because the mean of (d_k + n_k)^2 has the variance (4 mean(d^2) sigma^2 + 2 sigma^4) / N, where mean(d^2) is
-e^2 - sigma^2. It does not contain the variation between recordings. The error against the truth is
+e^2 - sigma^2. For the error of the vector, whose noise has the variance sigma^2 / 3 along each axis, N is three times
+the number of samples. It does not contain the variation between recordings. The error against the truth is
 
     e^2 = a^2 |M K - 1|_F^2 / 3 + |M (b - b_hat)|^2
 
@@ -41,9 +42,9 @@ import numpy as np
 import pandas as pd
 
 from pipeline.core.records import BASE, BIAS, SENSOR_UNITS, SENSORS, matrix_of
+from pipeline.core.verdicts import error_of
 from pipeline.output.pages.chart import Figure
 from pipeline.output.pages.group_charts import COLOURS, Point, bars, curves
-from pipeline.output.pages.held_out_section import first_and_last_step
 from pipeline.output.pages.numbers import measured, number
 from pipeline.output.pages.parameters import fitted_parameters
 
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from pipeline.core.files import JSON
+    from pipeline.core.verdicts import Error
 
 TEST_LEVEL = 0.05  # of a test, and 1 minus the coverage of an interval (JCGM 100:2008, 6.2.2: about 95 %)
 MEASURES = {"after": "rms error, held out", "truth": "rms error against the truth"}
@@ -240,18 +242,18 @@ def unit_figures(calibration: JSON, validation: JSON, diagnosis: JSON | None) ->
     for sensor in SENSORS:
         part, held_out = calibration.get(sensor), validation.get(sensor)
         if part and held_out:
-            before, after = (step.get("rms_error") for step in first_and_last_step(held_out))
+            error = error_of(held_out)
             inputs = [i for i in calibration.get("inputs") or [] if i.get("role") in (sensor, "rests")]
             rows.append({
                 "unit": calibration["unit"],
                 "sensor": sensor,
-                "before": before,
-                "u_before": _noise_of_error(before, held_out),
-                "after": after,
-                "u_after": _noise_of_error(after, held_out),
+                "before": error.before,
+                "u_before": _noise_of_error(error.before, error, held_out),
+                "after": error.after,
+                "u_after": _noise_of_error(error.after, error, held_out),
                 "truth": None,
                 "u_truth": None,
-                "noise_floor": held_out.get("noise_floor"),
+                "noise_floor": error.floor,
                 "reference_rms": held_out.get("reference_rms"),
                 "table_time": sum(i.get("duration_s") or 0.0 for i in inputs) or None,
                 "verdict": ((diagnosis or {}).get(sensor) or {}).get("verdict") or "",
@@ -260,13 +262,13 @@ def unit_figures(calibration: JSON, validation: JSON, diagnosis: JSON | None) ->
     return rows
 
 
-def _noise_of_error(error: float | None, held_out: JSON) -> float | None:
+def _noise_of_error(rms: float | None, error: Error, held_out: JSON) -> float | None:
     """Return the standard uncertainty of a held-out error by the noise of its samples."""
-    floor, samples = held_out.get("noise_floor"), held_out.get("samples")
-    if not error or not floor or not samples:
+    samples = (held_out.get("samples") or 0) * (3 if error.kind == "vector" else 1)
+    if not rms or not error.floor or not samples:
         return None
-    noise = min(floor, error) ** 2
-    return math.sqrt(noise * (2.0 * error**2 - noise) / (2.0 * samples)) / error
+    noise = min(error.floor, rms) ** 2
+    return math.sqrt(noise * (2.0 * rms**2 - noise) / (2.0 * samples)) / rms
 
 
 def against_truth(figures: JSON, truth: JSON) -> float | None:

@@ -47,7 +47,7 @@ SIGNAL_NAMES = {
 
 
 def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:
-    """Return the upper limits of each effect that was not selected as text, and as share of the sensor file's limit.
+    """Return the upper limits of each effect that was not selected as text, and as share of the data sheet's limit.
 
     ``share`` is None where the sensor file has no limit; the largest come first. ``excluded``: whether the recordings
     exclude an effect of the size of that limit, and no answer of the answer set contains it.
@@ -76,7 +76,7 @@ def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:
 
 
 def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
-    """Draw upper limits as shares of the sensor file's limits; None without any."""
+    """Draw upper limits as shares of the data sheet's limits; None without any."""
     shown = [row for row in rows if row["share"]]
     if not shown:
         return None
@@ -90,7 +90,7 @@ def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
     )
     points = [Point(row["label"], row["share"], 3) for row in shown[:MOST_LIMITS]]
     figure = Figure(f"{sensor}-limits", finding, caption)
-    label = "upper limit over the sensor file's limit (logarithmic)"
+    label = "upper limit over the data sheet's limit (logarithmic)"
     return bars(figure, points, label, levels={"limit of the sensor file": 1.0})
 
 

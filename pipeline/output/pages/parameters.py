@@ -159,7 +159,7 @@ def parameter_rows(sensor: str, part: JSON, data_sheet: DataSheet) -> list[JSON]
     """Return bias, scale factor errors, cross-axis terms and effects.
 
     A row has ``p``, ``name``, ``limit`` (or None), ``share`` of the limit, and ``beyond``: whether the calibration
-    counts it as beyond the sensor file's limit. ``part``: the sensor's part of the calibration.
+    counts it as outside the data sheet's limit. ``part``: the sensor's part of the calibration.
     """
     fitted = fitted_parameters(part)
     beyond = {entry["parameter"] for entry in part.get("beyond_limits") or []}

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.core.records import SENSOR_UNITS, SENSORS
-from pipeline.output.history import difference, dropped, of_units
+from pipeline.output.history import difference, dropped, errors_of, of_units
 from pipeline.output.outcome import add_command, uncertainty_words
 from pipeline.output.pages.chart import Figure
 from pipeline.output.pages.group_charts import Point, bars
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.core.files import JSON
+    from pipeline.core.verdicts import Error
 
 MARK, LINK_MARK = "<!-- history -->", "<!-- history link -->"  # in templates/unit.html
 SHOWN = 12  # runs in a chart: the first, and the last ones
@@ -52,31 +53,32 @@ def with_history(page: str, states: Sequence[tuple[int, JSON]], times: Mapping[i
 
 def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
     """Draw the held-out error of a sensor by run, with its noise floor; None where it never changed."""
-    known: list[tuple[JSON, JSON]] = [(e, part) for e in entries if (part := e["state"].get(sensor)) and part["error"]]
-    if len({part["error"] for _, part in known}) < 2:
+    errors = errors_of([entry["state"] for entry in entries], sensor)
+    known = [(e, error, error.after) for e, error in zip(entries, errors, strict=True) if error.after]
+    if len({after for *_, after in known}) < 2:
         return None
     shown = known if len(known) <= SHOWN else [known[0], *known[1 - SHOWN :]]
-    unit, rows = SENSOR_UNITS[sensor], [_row(entry, part, sensor) for entry, part in shown]
-    first, last = known[-2][1]["error"], known[-1][1]["error"]
-    floor = known[-1][1]["floor"]
+    unit, rows = SENSOR_UNITS[sensor], [_row(entry, error, sensor) for entry, error, _ in shown]
+    (*_, first), (_, error, last) = known[-2:]
+    floor = error.floor
     if abs(last - first) <= UNCHANGED_ERROR * first:
         change = f"stays at {number(last)}"
     else:
         change = f"{'falls' if last < first else 'rises'} from {number(first)} to {number(last)}"
     ratio = f", {number(last / floor)} × the noise floor" if floor else ""
-    finding = f"{sensor.capitalize()}: in the last run the held-out error {change} {unit}{ratio}"
+    finding = f"{sensor.capitalize()}: in the last run the error of the {error.kind} {change} {unit}{ratio}"
     caption = "Error on held-out motion after each run that changed the unit, and the effects that it added or removed."
     figure = Figure(f"history-{sensor}", finding, caption)
     return bars(figure, rows, f"rms error, {unit} (logarithmic)", levels={f"noise floor {number(floor)}": floor or 0.0})
 
 
-def _row(entry: JSON, part: JSON, sensor: str) -> Point:
-    change, floor = entry["change"], part["floor"]
-    words = change.words(sensor) or ["effects of the other sensor"] if change else part["effects"]
+def _row(entry: JSON, error: Error, sensor: str) -> Point:
+    change, ratio = entry["change"], error.ratio
+    words = change.words(sensor) or ["effects of the other sensor"] if change else entry["state"][sensor]["effects"]
     label = f"run {entry['run']}" + (f"{':' if change else ' with'} {plain(', '.join(words))}" if words else "")
     label = label if len(label) <= LABEL_LETTERS else f"{label[: LABEL_LETTERS - 1]}…"
-    label += f", {number(part['error'] / floor)} × floor" if floor else ""
-    return Point(label, part["error"], 1 if floor and part["error"] < NEAR_FLOOR * floor else 3)
+    label += f", {number(ratio)} × floor" if ratio else ""
+    return Point(label, error.after, 1 if ratio and ratio < NEAR_FLOOR else 3)
 
 
 def times_of(entries: Sequence[JSON]) -> dict[int, str]:
@@ -103,7 +105,10 @@ def runs_data(entries: Sequence[JSON], settings: JSON) -> JSON | None:
         after = [next((s for s in reversed(states) if s[0] <= e["run"]), None) for e in compared]
         shown = dict(filter(None, after))
         if len(shown) > 1:
-            units.append([unit, [[run, _short(state)] for run, state in shown.items()]])
+            errors = {s: errors_of([*shown.values()], s) for s in SENSORS}
+            of_runs = [{s: errors[s][i] for s in SENSORS} for i in range(len(shown))]
+            short = [[run, _short(state, of)] for (run, state), of in zip(shown.items(), of_runs, strict=True)]
+            units.append([unit, short])
     runs = [[e["run"], f"run {e['run']}, {times[e['run']]}: {_count(e)}"] for e in compared]
     gone = [
         {"unit": unit, "run": run, "effects": effects, "add": add_command(settings, unit, effects)}
@@ -117,9 +122,9 @@ def _count(entry: JSON) -> str:
     return f"{count} unit{'s' if count != 1 else ''} changed" if entry["run"] > 1 else f"{count} units"
 
 
-def _short(state: JSON) -> JSON:
+def _short(state: JSON, errors: Mapping[str, Error]) -> JSON:
     if not state:
         return {"status": "not in units.csv"}
     parts = {s: state[s] for s in SENSORS if state.get(s)}
-    shown = {s: [part[key] for key in ("error", "floor", "verdict", "effects")] for s, part in parts.items()}
+    shown = {s: [errors[s].after, errors[s].floor, part["verdict"], part["effects"]] for s, part in parts.items()}
     return {"status": state["status"], "overrides": state["overrides"], **shown}
