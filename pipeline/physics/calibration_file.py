@@ -43,6 +43,7 @@ from pipeline.core.records import (
     READABLE_VERSIONS,
     SENSOR_UNITS,
     SENSORS,
+    TURN_AXES,
     FittedEffect,
     SensorCalibration,
     Values,
@@ -446,8 +447,19 @@ def not_determined(part: Mapping[str, Any]) -> str:
         advice = "rest the unit in more attitudes, each axis up and down, also half-way between two axes"
     if "matrix_" in names:
         about = [axis for axis in "xyz" if f"matrix_{axis}{axis}" in names]
-        turns = f"turn the unit about {' and '.join(about)} by a known angle, " if about else ""
-        advice = f"{turns}move it between rests in many attitudes, or state the axes of turns more accurately"
+        ways = [f"turn the unit about {' and '.join(about)} by a known angle"] if about else []
+        axes = next((d for stage in part["stages"] if (d := stage["details"].get(TURN_AXES))), None)
+        if axes and axes["stated_deg"] > axes["needed_deg"]:
+            needed = np.floor(100.0 * axes["needed_deg"]) / 100.0
+            ways.append(
+                f"set procedure.turns.axis_accuracy_deg (now {axes['stated_deg']:g}) to {needed:g} or less, where the "
+                "axes of the turns are known so well"
+            )
+        ways.append(
+            "log the accelerometer too, in rests in many attitudes with moves between them, or before and after turns "
+            "by 90 and -90 deg about each axis with gravity across it"
+        )
+        return f"the recordings do not determine {names} better than the limit of the sensor file: {', or '.join(ways)}"
     return f"the rests do not determine {names}, known by the limit of the sensor file alone: {advice}"
 
 

@@ -4,9 +4,11 @@ from imu_logs.log import Index, Integers, Mask, Note, Values
 from imu_logs.units import AXES, SENSOR_UNITS, SENSORS
 from pipeline.core.records.budget import (
     LIMIT,
+    LINEAR,
     MONTE_CARLO,
     NORMAL,
     RECTANGULAR,
+    TURN_AXES,
     Budget,
     BudgetLine,
     Contribution,
@@ -98,6 +100,7 @@ __all__ = [
     "BIAS",
     "BIAS_NAMES",
     "LIMIT",
+    "LINEAR",
     "MATRIX",
     "MATRIX_NAMES",
     "MATRIX_ROWS",
@@ -110,6 +113,7 @@ __all__ = [
     "SCHEMA_VERSION",
     "SENSORS",
     "SENSOR_UNITS",
+    "TURN_AXES",
     "Agreement",
     "Answer",
     "Budget",

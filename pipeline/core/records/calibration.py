@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 import numpy as np
 
 from imu_logs.units import SENSOR_UNITS
-from pipeline.core.records.budget import LIMIT, Budget, BudgetLine, finite, unlimited
+from pipeline.core.records.budget import LIMIT, LINEAR, Budget, BudgetLine, finite, unlimited
 from pipeline.core.records.correction import CorrectionStep, published, steps_of
 from pipeline.core.records.parameters import (
     BASE,
@@ -126,9 +126,10 @@ class SensorCalibration:
     def by_limit(self) -> Mask:
         """Whether the sensor file's limit, and not the recordings, determines bias and matrix: (12,) array.
 
-        It causes more than half of the variance.
+        It causes more than half of the variance; the squares of other parameters, which are small, do not count.
         """
-        of_limit = sum(line.standard_uncertainty[BASE] ** 2 for line in self.lines if line.source == LIMIT)
+        lines = [line for line in self.lines if line.source == LIMIT]
+        of_limit = sum(line.parts.get(LINEAR, line.standard_uncertainty)[BASE] ** 2 for line in lines)
         return np.asarray(of_limit > 0.5 * np.diag(self.parameters.covariance)[BASE])
 
     def to_json(self) -> dict[str, Any]:

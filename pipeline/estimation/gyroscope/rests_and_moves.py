@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError
-from pipeline.core.records import BASE_COUNT, MATRIX, MATRIX_NAMES, Multiply, SensorCalibration, StageResult, Subtract
+from pipeline.core.records import (
+    BASE_COUNT,
+    MATRIX,
+    MATRIX_NAMES,
+    TURN_AXES,
+    Multiply,
+    SensorCalibration,
+    StageResult,
+    Subtract,
+)
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.multi_position.effects import accelerometer_of, frame_error
@@ -47,6 +56,7 @@ FIT_STAGES = {NAME: FitStage(sensors=("gyroscope",), accepts=("readings",), chan
 MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg
 # standard uncertainty beyond which an element of the matrix is called undetermined
 MAX_KNOWN_ELEMENT_UNCERTAINTY = 0.05
+CLEARLY_BELOW = 0.9  # of the limit: axes of turns that are known so well, and noise, are less uncertain than it
 RECORDING_ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 
@@ -124,7 +134,11 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
         details[MOVED] = moved.tolist()
     if model.turns is not None:
         details["turns"] = model.turns.described(fitted.state)
-        details["departures"] = model.turns.departures(fitted.state)
+        off = fitted.residual * fitted.error
+        if sheet and procedure.turns:
+            needed = CLEARLY_BELOW * float(np.degrees(data_sheet.cross_axis / np.sqrt(3.0)))
+            details[TURN_AXES] = {"stated_deg": procedure.turns.axis_accuracy_deg, "needed_deg": needed}
+        details["departures"] = model.turns.departures(off[model.of_turns], fitted.deviation[model.of_turns])
     stage = StageResult(NAME, correction=(Subtract(fitted.state.bias), Multiply(fitted.state.matrix)), details=details)
     before = SensorCalibration("gyroscope", stages=previous.stages if previous else ())
     return after_stage(before, stage, model, fitted, settings, other=accelerometer)

@@ -149,7 +149,7 @@ class TurnsByHand:
 
     def described(self, state: State) -> list[dict[str, Any]]:
         """Return recording, start in s, axis, stated and calibrated total angle in deg of each turn."""
-        angles = self._about(state)
+        angles = self._angles(state)
         return [
             {
                 "recording": self.name[t],
@@ -161,33 +161,35 @@ class TurnsByHand:
             for t, direction in enumerate(self.direction)
         ]
 
-    def departures(self, state: State) -> list[str]:
-        """Describe the calibrated turns that differ from the stated angle by more than its uncertainty."""
-        off = np.abs(np.einsum("rti,ti->r", self.rows, self._angles(state)) - self.value)
+    def departures(self, residual: Values, deviation: Values) -> list[str]:
+        """Describe the turns that differ from what is stated by more than its uncertainty, noise and bias explain.
+
+        ``residual``, ``deviation``: of the equations, and standard deviation, (r,), deg.
+        """
         count = len(self.name)
+        angle = "angle_accuracy_deg" if self.by_length else "procedure.turns.accuracy_deg"
         turned = [
-            (f"the turn at {self.time[t, 0]:.1f} s of {self.name[t]} is", off[t], self.error[t], "accuracy_deg")
+            (f"the turn at {self.time[t, 0]:.1f} s of {self.name[t]} is", abs(residual[t]), deviation[t], angle)
             for t in range(count)
         ]
-        across = np.linalg.norm(off[count:].reshape(-1, 2), axis=1)
+        across = np.linalg.norm(residual[count:].reshape(-1, 2), axis=1)
         first = [name_of_axis(self.direction[self.group == group][0]) for group in np.unique(self.group)]
         turned += [
-            (f"the axis of the turns about {axis} is", angle, self.error[-1], "axis_accuracy_deg")
-            for axis, angle in zip(first, across, strict=True)
+            (f"the axis of the turns about {axis} is", off, error, "procedure.turns.axis_accuracy_deg")
+            for axis, off, error in zip(first, across, deviation[count::2], strict=True)
         ]
         return [
-            f"{what} {angle:.1f} deg off, {angle / error:.1f} times procedure.turns.{name}"
-            for what, angle, error, name in turned
-            if angle > DEPARTS * error
+            f"{what} {off:.2g} deg off, {off / error:.1f} times {name} with noise and bias"
+            for what, off, error, name in turned
+            if off > DEPARTS * error
         ]
 
     def _angles(self, state: State) -> Values:
-        """Return Phi: (t, 3) array, deg."""
-        return np.asarray(np.einsum("ts,tsi->ti", self.weight, self._samples(state)[1]) @ state.matrix.T)
-
-    def _about(self, state: State) -> Values:
-        """Return the angle of each turn about its direction: (t,) array, deg."""
-        return np.asarray(np.sum(self._angles(state) * self.direction, axis=1))
+        """Return the total angle of each turn, as it is stated: (t,) array, deg."""
+        Phi = np.einsum("ts,tsi->ti", self.weight, self._samples(state)[1]) @ state.matrix.T
+        if self.by_length:
+            return np.asarray(np.sign(self.stated) * np.linalg.norm(Phi, axis=1))
+        return np.asarray(np.sum(Phi * self.direction, axis=1))
 
     def _samples(self, state: State) -> tuple[Motion, Values]:
         """Return the motion of all samples, and ``v = y - b - z``."""

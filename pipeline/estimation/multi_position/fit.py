@@ -86,6 +86,12 @@ class FitByHand:
         return self.equations.error
 
     @property
+    def deviation(self) -> Values:
+        """Standard deviation of each residual by all noise, without k, in the unit of ``error``: (n,) array."""
+        variance = [weight * np.diag(self.equations.covariance(noise)) for noise, weight, _ in self.hypotheses]
+        return np.asarray(self.error * np.sqrt(np.sum(variance, axis=0)))
+
+    @property
     def noise(self) -> NoiseHypothesis:
         """The most likely hypothesis."""
         return self._every[0][self._likeliest]
@@ -357,9 +363,10 @@ def with_limits(
 ) -> Fitted:
     """Fit with pseudo-observations of those parameters that the recordings determine worse than the sensor file.
 
-    A parameter keeps its pseudo-observation where its variance is more than half of that of its limit: it is then
-    mostly the limit's. ``limits``: name to standard uncertainty. ``solve_with``: fits with some of them, and returns
-    the fit and the standard uncertainties of all; raises an error if they leave a combination open.
+    A parameter keeps its pseudo-observation where its variance is more than half of that of its limit, or without one
+    more than all of it: it is then mostly the limit's. ``limits``: name to standard uncertainty. ``solve_with``: fits
+    with some of them, and returns the fit and the standard uncertainties of all; raises an error if they leave a
+    combination open.
     """
     u = np.array(list(limits.values()))
 
@@ -374,7 +381,7 @@ def with_limits(
         except (NotObservableError, CannotCalibrateError):
             known_now = known
         else:
-            if not np.any(~kept & (known_now > u * np.sqrt(0.5))):
+            if not np.any(~kept & (known_now > u)):
                 return found
         kept[int(np.argmax(np.where(kept, 0.0, known_now / u)))] = True
     return every

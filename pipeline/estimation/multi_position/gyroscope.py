@@ -104,6 +104,8 @@ class GyroscopeModel:
         self.directions = np.eye(BASE_COUNT)[:, BASE if free else BIAS]
         self.rests_equations = 3 * len(self.rests.time)
         self.of_moves = slice(self.rests_equations, self.rests_equations + (2 * self.moves.count if self.moves else 0))
+        last = self.of_moves.stop
+        self.of_turns = slice(last, last + (len(turns.error) if turns else 0))
         self.gravity = float(np.median(np.linalg.norm(gravity.force, axis=1)))
         if self.moves is not None:
             self.before, self.after = gravity.at_end[self.moves.before], gravity.at_start[self.moves.after]

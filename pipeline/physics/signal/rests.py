@@ -164,18 +164,25 @@ def _rests_by_readings(recording: Recording) -> list[Rest]:
         interval = _interval(recording)
         cut, shortest = round(settling.left_out_s / interval), _shortest(recording)
         pieces = [(max(a, min(a + cut, b - shortest)), b) for a, b in pieces]
+    if recording.accelerometer is None:
+        return _at_the_ends(recording, pieces)
     return assess_rests(recording, pieces, noise)
 
 
 @once
 def _quiet_parts(recording: Recording) -> tuple[Spans, float]:
-    """Return the parts in which both sensors are quiet, and the noise: variance of the specific force, g^2."""
-    force = recording.accelerometer
+    """Return the parts in which both sensors are quiet, and the noise: variance of the specific force, g^2.
+
+    In a turn of a sheet the gyroscope may be alone: the parts are those of an even rate.
+    """
+    alone = recording.accelerometer is None and recording.kind == "turn"
+    readings = recording.gyroscope if alone else recording.accelerometer
     size = max(5, round(WINDOW_S / _interval(recording))) if recording.samples > 1 else 5
-    if force is None or recording.samples < 2 * size:
+    if readings is None or recording.samples < 2 * size:
         return [], 0.0
-    variance = windows(force, size)[1]
-    rounding = float(np.sum(counts_of(np.abs(np.diff(force[np.isfinite(force).all(axis=1)], axis=0))) ** 2)) / 12.0
+    variance = windows(readings, size)[1]
+    steps = np.abs(np.diff(readings[np.isfinite(readings).all(axis=1)], axis=0))
+    rounding = float(np.sum(counts_of(steps) ** 2)) / 12.0
     noise = max(float(np.percentile(variance, 5.0)), rounding, MIN_NOISE_VARIANCE_G2)
     variance[_spoilt(recording, size)] = np.inf
     found = [_below(variance, multiple * noise, recording, size) for multiple in VARIANCE_MULTIPLES]
@@ -230,6 +237,22 @@ def _shortest(recording: Recording) -> int:
     return max(5, round(WINDOW_S / interval), round(SHORTEST_REST_S / interval))
 
 
+def _at_the_ends(recording: Recording, quiet: Spans) -> list[Rest]:
+    """Return the rests of a turn that the gyroscope alone recorded: it reads the same before and after the turn.
+
+    Without recordings at rest, and with one rest or two that differ, an even rate is not told from a rest.
+    """
+    if RATE_AT_REST not in recording.source:
+        means = [np.asarray(recording.gyroscope)[a:b].mean(axis=0) for a, b in (quiet[:1] + quiet[-1:])]
+        if len(quiet) < 2 or np.max(np.abs(means[0] - means[1])) > RATE_LIMIT_DPS:
+            return []
+        source = {**recording.source, RATE_AT_REST: np.mean(means, axis=0).tolist()}
+        recording = replace(recording, source=source)
+    rests = [Rest(start, stop) for start, stop in quiet]
+    reasons = _rate_reasons(recording, rests)
+    return [replace(r, accepted=not reason, reason=reason) for r, reason in zip(rests, reasons, strict=True)]
+
+
 def _interval(recording: Recording) -> float:
     """Return the mean time between samples, s, without gaps; the median would be wrong for stamps in bursts."""
     steps = np.diff(recording.time_ns)
@@ -253,11 +276,10 @@ def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noi
 
 def _spoilt(recording: Recording, size: int) -> Mask:
     """Return the windows with a clipped, stuck or missing reading, or over a gap as long as a window."""
-    assert recording.accelerometer is not None  # noqa: S101
-    bad = np.logical_not(np.all(np.isfinite(recording.accelerometer), axis=1))
-    bad |= ~recording.valid
-    if recording.gyroscope is not None:
-        bad |= np.logical_not(np.all(np.isfinite(recording.gyroscope), axis=1))
+    bad = ~recording.valid
+    for readings in (recording.accelerometer, recording.gyroscope):
+        if readings is not None:
+            bad |= ~np.isfinite(readings).all(axis=1)
     bad[1:] |= np.diff(recording.time_ns) > size * _interval(recording) * 1e9
     total = np.concatenate([[0], np.cumsum(bad)])
     return total[size:] > total[:-size]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import pipeline
 from pipeline.app.field_logs.compensate import compensate_log
 from pipeline.core.errors import InputError
 from pipeline.core.records import SensorCalibration
+from pipeline.physics.calibration_file import not_determined
 from pipeline.physics.compensation import load
 from tests.study.listed_recordings import Unit, at_rest, joined, turned
 
@@ -67,6 +69,61 @@ def test_an_axis_that_is_known_to_a_degree_leaves_the_cross_axis_terms_to_the_se
     limit = 0.02 / np.sqrt(3.0)  # cross_axis of the sensor file
     assert np.all(U[~np.eye(3, dtype=bool)] > 1.5 * limit)
     assert np.all(U[~np.eye(3, dtype=bool)] < 2.5 * limit)
+
+
+def test_the_setting_that_would_determine_cross_axis_terms_is_named_and_does(tmp_path: Path) -> None:
+    with_three_turns(tmp_path)
+    open_ = not_determined(calibrated(tmp_path).calibration["gyroscope"])
+    assert open_.startswith("the recordings do not determine matrix_xy, matrix_xz, matrix_yx")
+    named = re.search(r"(procedure\.turns\.axis_accuracy_deg) \(now 1\.5\) to ([\d.]+) or less", open_)
+    assert named
+    found = calibrated(tmp_path, f"{named[1]}={named[2]}").calibration["gyroscope"]
+    assert set(np.ravel(found["determined_by"]["matrix"])) == {"recordings"}
+    assert not not_determined(found)
+
+
+def test_a_scale_factor_by_turns_is_of_the_recordings_though_the_sensor_file_holds_the_axes(tmp_path: Path) -> None:
+    unit, up = Unit(tmp_path, np.random.default_rng(9)), np.array([0.0, 0.0, 1.0])
+    for axis, e in zip("xyz", np.eye(3), strict=True):
+        turn = joined(at_rest(4.0, up), turned(360.0, 90.0, e, up), at_rest(4.0, up))
+        unit.write(f"turn_{axis}", f"turn,{axis},360,0.5,", *turn)
+    unit.sheet()
+    part = calibrated(tmp_path).calibration["gyroscope"]
+    assert {part["determined_by"]["matrix"][i][i] for i in range(3)} == {"recordings"}
+
+
+@pytest.mark.parametrize("sensors", ["g", "ag"])
+def test_bias_and_noise_are_no_departure_of_a_turn_whose_angle_is_stated_as_exact(tmp_path: Path, sensors: str) -> None:
+    # In ten seconds the bias between files turns by 0.1 deg, ten times the stated accuracy.
+    unit, up = Unit(tmp_path, np.random.default_rng(10)), np.array([0.0, 0.0, 1.0])
+    unit.write("still", "rest,,,,", *at_rest(60.0, up), sensors)
+    for axis, e in zip("xyz", np.eye(3), strict=True):
+        turn = joined(at_rest(4.0, up), turned(360.0, 90.0, e, up), at_rest(4.0, up))
+        unit.write(f"turn_{axis}", f"turn,{axis},360,0.01,", *turn, sensors)
+    unit.sheet()
+    result = calibrated(tmp_path)
+    assert result.verdict["gyroscope"] == "not_enough_data"
+    assert not [d for s in result.calibration["gyroscope"]["stages"] for d in s["details"].get("departures", ())]
+
+
+def test_two_turns_that_contradict_each_other_are_doubted(tmp_path: Path) -> None:
+    unit = with_three_turns(tmp_path)
+    up, e = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+    turn = joined(at_rest(4.0, up), turned(366.0, 90.0, e, up), at_rest(4.0, up))
+    unit.write("again", "turn,x,360,0.05,", *turn, "g")
+    unit.sheet()
+    result = calibrated(tmp_path)
+    assert result.verdict["gyroscope"] == "reference_in_doubt"
+    assert "times angle_accuracy_deg with noise and bias" in result.diagnosis["gyroscope"]["reason"]
+
+
+def test_rests_beside_a_turn_are_found_without_an_accelerometer(tmp_path: Path) -> None:
+    unit = with_three_turns(tmp_path)
+    stage = calibrated(tmp_path).calibration["gyroscope"]["stages"][-1]["details"]
+    assert stage["rests"] == 7  # one alone, and two beside each turn
+    for turn in stage["turns"]:
+        assert turn["time_s"] == pytest.approx(4.0, abs=0.6)
+    assert unit.rows
 
 
 def test_a_turn_in_the_other_sense_is_refused_with_the_angle_that_agrees(tmp_path: Path) -> None:
