@@ -14,8 +14,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from imu_logs.errors import IngestError
+from imu_logs.files import BINARY, is_binary
 from imu_logs.profile import COMMENTED, DROP, GAP
-from imu_logs.units import BRACKETS, CHANNELS, GYROSCOPE, SPELLINGS, TRIADS, UNITS, unit_in_brackets
+from imu_logs.units import (
+    BRACKETS,
+    CHANNELS,
+    FORCE_UNITS,
+    GYROSCOPE,
+    SPELLINGS,
+    TRIADS,
+    UNITS,
+    unit_in_brackets,
+    unit_spelt,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,8 +36,13 @@ if TYPE_CHECKING:
     Triad = tuple[int, int, int]
 
 COUNTING = 0.98  # share of steps by exactly 1
+FEW = 0.01  # share of rows at which it falls: between sessions
+MOSTLY = 0.2  # share of rows at which the time of a log without names rises
 FEWEST_RISES = 4  # of a time, per fall; a noisy reading falls as often as it rises
 MAX_INTERVAL_SCATTER = 0.2  # of intervals, relative to their median: above, times are of arrival, not of sampling
+OF_A_RATE = 0.5  # relative spread of the length of a rate, and more; of a specific force in flight less
+LARGEST_SPREAD = 0.2  # relative, of the length of a vector that is gravity: a walk
+LOW_COST_ERROR = 0.12  # bias and scale factor of a low-cost sensor in one position
 TEMPERATURE_RANGE = (-60.0, 130.0)  # degC, of electronics and their tests
 
 OFFSETS = (32768.0, 8192.0, 2048.0)  # middle of unsigned 16, 14 and 12 bits
@@ -34,6 +50,7 @@ NEAR_OFFSET = 1 / 16  # of the offset, for median rates: 16 deg/s of +-250 deg/s
 
 WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d")
 MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|om|omega|rot|rate)([xyz])")
+IN_G = re.compile(r"[xyz]_?g", re.IGNORECASE)  # a rate, or a specific force in g
 AXIS_WORDS = ("x", "y", "z", "0", "1", "2", "3")
 SENSOR_WORDS = {
     "accelerometer": {"a", "ac", "acc", "accl", "accel", "accelerometer", "acceleration", "f", "force"},
@@ -87,6 +104,10 @@ UNIT_ENDINGS = (
     ("us", ("us", "micros", "usec", "microseconds")), ("ns", ("ns", "nanos", "nsec", "nanoseconds")), ("deg", ("deg",)),
 )  # fmt: skip
 LINES_TRIED = 400  # with each separator
+TEXT_TRIED = 1 << 16  # bytes that show whether a file is a text
+BYTES_OF_A_CHARACTER = 4  # at most, of UTF-8
+MOST_ROWS_OF_NAMES = 2  # above the last one: of the sensor, of the channel
+SINCE_1970_S = (1e9, 4e9)  # 2001 to 2096
 MAX_PARSED_ROWS = 200_000  # that are parsed; limits the time
 MIN_ROWS = MIN_COLUMNS = 3  # of the log of a three-axis sensor
 SEPARATORS = (",", ";", "\t", "|", " ")
@@ -111,6 +132,7 @@ class Columns:
     steady: bool = True  # time, or the counter of samples, never decreases
     turn: tuple[float, str] | None = None  # counts per turn of the table's encoder, and the evidence
     remarks: list[str] = field(default_factory=list)
+    guessed: bool = False  # the triads follow from their numbers alone
 
     def free(self) -> list[int]:
         """Return the columns of numbers that are assigned to no channel."""
@@ -171,6 +193,7 @@ def find_columns(log: UnknownLog) -> Columns:
     for sensor, triad in _triads_by_one_letter(log).items():
         if not times & set(triad):
             columns.triads.setdefault(sensor, triad)
+    _find_forces_in_g(columns)
     axes_only = columns.triads.pop("?", None)
     if axes_only is not None and not columns.triads:
         columns.triads[_sensor_of_file(log, axes_only)] = axes_only
@@ -187,6 +210,14 @@ def find_columns(log: UnknownLog) -> Columns:
         elif w == ["t"] and possible and not _advances(values):  # a column called T, which could also be a time
             columns.others.setdefault("temperature", i)
     return columns
+
+
+def _find_forces_in_g(columns: Columns) -> None:
+    """Take xg, yg, zg as a specific force in g if they have its size."""
+    triad, names = columns.triads.get("gyroscope"), columns.log.names
+    named = triad is not None and len(columns.triads) == 1 and all(IN_G.fullmatch(names[i]) for i in triad)
+    if triad and named and _is_gravity(columns.log, triad):
+        columns.triads = {"accelerometer": triad}
 
 
 def _triads_by_one_letter(log: UnknownLog) -> dict[str, Triad]:
@@ -245,13 +276,17 @@ def _find_time(columns: Columns, words: dict[int, list[str]]) -> None:
     first = [i for i in of_arrays if columns.log.names[i].partition(" [")[0].endswith("[0]")]
     counting = {i for i, w in of_sensor.items() if set(w) & COUNTER_WORDS and not set(w) & TIME_WORDS}
     counters += [i for i in rising if i in counting and i not in counters]
+    if not columns.log.named:  # a time that some rows repeat or that starts again; a slow reading may rise, too
+        steps = {i: np.diff(v) for i, v in numbers.items() if v[0] >= 0}
+        rising = [i for i, d in steps.items() if np.mean(d > 0) > MOSTLY and np.mean(d < 0) < FEW]
+        rising = [i for i in rising if i <= rising[0] + 1]
     unnamed = [i for i in sorted({*rising, *first}) if i not in counters and (not columns.log.named or i in of_sensor)]
     alike = all(np.array_equal(numbers[i], numbers[unnamed[0]]) for i in unnamed[1:])  # of each array of a recording
     unnamed = unnamed if not columns.log.named or (unnamed and alike) else []
     candidates = [i for i in named if i in rising] or [i for i in named if _advances(numbers[i])] or unnamed
     gap_free = [i for i in counters if i not in candidates and bool(np.all(np.diff(numbers[i]) == 1.0))]
-    steps = np.diff(numbers[candidates[0]]) if candidates else np.zeros(1)
-    if gap_free and steps.sum() > 0 and np.std(steps) > MAX_INTERVAL_SCATTER * abs(float(np.median(steps))):
+    intervals = np.diff(numbers[candidates[0]]) if candidates else np.zeros(1)
+    if gap_free and intervals.sum() > 0 and np.std(intervals) > MAX_INTERVAL_SCATTER * abs(float(np.median(intervals))):
         columns.arrival, columns.counter = candidates[0], gap_free[0]
     elif candidates:
         columns.time = candidates[0]
@@ -327,11 +362,22 @@ def _spread(log: UnknownLog, triad: Triad, offset: float) -> float:
     return float((high - low) / max(middle, 1e-30))
 
 
+def _is_gravity(log: UnknownLog, triad: Triad) -> bool:
+    """Return whether the length of vectors is gravity in g or m/s^2, or about it; a pressure in hPa would be mg."""
+    size = float(np.median(np.linalg.norm([log.numbers[i] for i in triad], axis=0)))
+    near = any(abs(size / FORCE_UNITS[unit] - 1.0) < LOW_COST_ERROR for unit in ("g", "m/s^2"))
+    return near and _spread(log, triad, 0.0) < OF_A_RATE
+
+
 def _find_triads_without_names(columns: Columns) -> None:
     """Find the triads of a log without names: the length of the accelerometer's vector varies least."""
     log = columns.log
-    free = [i for i, v in log.numbers.items() if i not in columns.of_time() and np.ptp(v) > 0]
-    groups = list(zip(free[::3], free[1::3], free[2::3], strict=False))
+    other = tuple(word for word in NO_SENSOR if len(word) > len("xyz") - 1)
+    arrays: dict[str, list[int]] = {}
+    for i, v in log.numbers.items():
+        if i not in columns.of_time() and np.ptp(v) > 0 and not any(word in log.names[i].lower() for word in other):
+            arrays.setdefault(log.names[i].partition("[")[0] if "[" in log.names[i] else "", []).append(i)
+    groups = [triad for a in arrays.values() for triad in zip(a[::3], a[1::3], a[2::3], strict=False)]
 
     def called(triad: Triad) -> str:
         return f"columns {triad}" if not log.named else ", ".join(log.names[i] for i in triad)
@@ -339,12 +385,18 @@ def _find_triads_without_names(columns: Columns) -> None:
     if len(groups) == 1:
         sensor = _sensor_of_file(log, groups[0])
         columns.triads[sensor] = groups[0]
+        columns.guessed = "gyr" not in Path(log.path).stem.lower()
         columns.remarks.append(f"no names: {called(groups[0])} are taken as the {sensor}'s x, y, z; check it")
     elif groups:
         offset = _offset(log, groups)
-        force = min(groups, key=lambda group: _spread(log, group, offset))
+        of_gravity = [group for group in groups if _is_gravity(log, group)]
+        force = min(of_gravity or groups, key=lambda group: _spread(log, group, offset))
         rate = next(group for group in groups if group != force)
+        if not of_gravity and _spread(log, force, offset) > LARGEST_SPREAD:
+            columns.remarks.append("no names, and no three columns have the length of gravity: state the columns")
+            return
         columns.triads |= {"accelerometer": force, "gyroscope": rate}
+        columns.guessed = True
         columns.remarks.append(
             f"no names: {called(force)} are taken as the accelerometer's x, y, z, because their length varies by only "
             f"{_spread(log, force, offset):.1%}, and {called(rate)} as the gyroscope's; check it"
@@ -369,15 +421,21 @@ class UnknownLog:
     @property
     def named(self) -> bool:
         """Whether the columns have names."""
-        return self.csv["header"] is not False
+        return self.names != _numbered(len(self.names))
 
 
 def find_layout(data: bytes, path: str) -> UnknownLog:
     """Split a text into columns; raises ``IngestError`` if it contains no table of numbers."""
-    lines = data.decode("utf-8", "replace").splitlines()
+    if is_binary(data[:TEXT_TRIED]):
+        raise IngestError(f"{BINARY} (it starts with the bytes {data[:4].hex(' ')})", path, code="foreign")
+    numbered = [(i, line) for i, line in enumerate(_decoded(data).splitlines()) if line.strip()]
+    lines, places = [line for _, line in numbered], [i for i, _ in numbered]
     tried = [_try(lines[:LINES_TRIED], separator, decimal) for separator in SEPARATORS for decimal in NUMBER]
     width, start, separator, decimal = max(tried, key=lambda t: (t[0], -t[1]))
-    names, skip, comment = _names(lines, start, separator)
+    names, skip, comment, by_index = _names(lines, start, separator)
+    rate_hz, rate_line = _stated_rate(lines[:start])
+    if start == 0 and (e4_rate := _rate_of_empatica(lines, separator)) is not None:
+        rate_hz, rate_line, start, skip = e4_rate, lines[1].strip(), 2, 2
     parsed = lines[start : start + MAX_PARSED_ROWS]
     rows = [cells for cells in _cells(parsed, separator) if len(cells) == len(names)]
     bad = _bad_rows(rows, decimal)
@@ -386,15 +444,13 @@ def find_layout(data: bytes, path: str) -> UnknownLog:
     if width < MIN_COLUMNS or len(rows) < MIN_ROWS or not numbers:
         first = " / ".join(lines[:3])[:150]
         raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, code="no_table")
-    stated = ((STATED_NUMBER.search(line), line.strip()) for line in lines[:start] if RATE_KEY.search(line))
-    rates = ((float(match.group(1)), line) for match, line in stated if match)
-    rate_hz, rate_line = next((rate for rate in rates if rate[0]), (None, ""))
-    named, odd = names != _numbered(len(names)), len(parsed) - len(rows) - len(bad)
+    odd = len(parsed) - len(rows) - len(bad)
+    skip = start if by_index else skip
     csv_section = {
         "delimiter": "whitespace" if separator == " " else separator,
         "decimal": decimal,
-        "header": COMMENTED if named and comment is not None else named,
-        "skip_lines": 0 if comment is not None else skip,
+        "header": False if by_index else COMMENTED if comment is not None else True,
+        "skip_lines": places[skip] if skip and comment is None else 0,
         "comment": comment,
         "rate_hz": rate_hz,
     }
@@ -406,15 +462,41 @@ def find_layout(data: bytes, path: str) -> UnknownLog:
         csv_section |= kinds
         what = f"{len(bad)} of {len(bad) + len(rows)} rows hold a cell that is no number: each is left out, and noted"
         evidence |= dict.fromkeys(kinds, what)
-    return UnknownLog(
-        path, csv_section, [*(names if named else range(len(names)))], names, numbers, evidence, remarks, texts
-    )
+    keys = [*(range(len(names)) if by_index else names)]
+    return UnknownLog(path, csv_section, keys, names, numbers, evidence, remarks, texts)
+
+
+def _decoded(data: bytes) -> str:
+    """Return the text without byte order mark: UTF-8, or another code of one byte a character."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        cut = error.start > len(data) - BYTES_OF_A_CHARACTER
+        return data.decode("utf-8-sig", "replace") if cut else data.decode("latin-1")
+
+
+def _stated_rate(lines: Sequence[str]) -> tuple[float | None, str]:
+    """Return the sampling rate that a line above the table states, and the line."""
+    stated = ((STATED_NUMBER.search(line), line.strip()) for line in lines if RATE_KEY.search(line))
+    rates = ((float(match.group(1)), line) for match, line in stated if match)
+    return next((rate for rate in rates if rate[0]), (None, ""))
+
+
+def _rate_of_empatica(lines: list[str], separator: str) -> float | None:
+    """Return the rate of an export of Empatica's E4: its first row repeats the start, its second one the rate in Hz."""
+    first, second = ([*dict.fromkeys(cell.strip() for cell in cells)] for cells in _cells(lines[:2], separator))
+    if len(first) == len(second) == 1 and NUMBER["."].fullmatch(first[0]) and NUMBER["."].fullmatch(second[0]):
+        return float(second[0]) if SINCE_1970_S[0] < float(first[0]) < SINCE_1970_S[1] else None
+    return None
 
 
 def _cells(lines: Sequence[str], separator: str) -> list[list[str]]:
     if separator == " ":
         return [line.split() for line in lines]
-    return list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
+    try:
+        return list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
+    except csv.Error:  # a field that is too long, of a text that is no table
+        return [[line] for line in lines]
 
 
 def _numbered(count: int) -> list[str]:
@@ -433,8 +515,12 @@ def _try(lines: list[str], separator: str, decimal: str) -> tuple[int, int, str,
     return width, start, separator, decimal
 
 
-def _names(lines: list[str], start: int, separator: str) -> tuple[list[str], int, str | None]:
-    """Return the names of the columns, the number of lines before them, and the start of comments."""
+def _names(lines: list[str], start: int, separator: str) -> tuple[list[str], int, str | None, bool]:
+    """Return the names of the columns, the lines before them, the start of comments, and whether names do not serve.
+
+    Where names repeat, those of several sensors or units of the columns, each is put behind the name above it, and a
+    profile refers to the columns by their indices.
+    """
     width = len(_cells([lines[start]], separator)[0]) if lines else 0
     line = lines[start - 1].lstrip() if start else ""
     comment = next((mark for mark in COMMENTS if line.startswith(mark)), None)
@@ -444,9 +530,15 @@ def _names(lines: list[str], start: int, separator: str) -> tuple[list[str], int
         names.append("")  # the rows end in a separator
     if len(names) == width + 1 and not names[-1]:
         names.pop()  # the header does
-    if len(names) == width and not any(NUMBER["."].fullmatch(name) for name in names):
-        return names, start - 1, comment
-    return _numbered(width), start, comment
+    if len(names) != width or any(NUMBER["."].fullmatch(name) for name in names):
+        return _numbered(width), start, comment, True
+    by_index = not names[0] or len(names) - names.count("") > len({*names} - {""})
+    for cells in _cells(lines[max(start - 1 - MOST_ROWS_OF_NAMES, 0) : start - 1][::-1], separator):
+        if not by_index or len({*names}) == width or len(cells) != width or not all(cells[1:]):
+            break
+        pairs = zip(cells, names, strict=True)
+        names = [f"{cell} [{n}]".strip() if unit_spelt(n) else f"{cell} {n}".strip() for cell, n in pairs]
+    return names, start - 1, comment, by_index
 
 
 def _bad_rows(rows: list[list[str]], decimal: str) -> dict[int, bool]:

@@ -5,7 +5,8 @@ The message states what is wrong, where, what was expected and what to do.
 
 from __future__ import annotations
 
-UNKNOWN_LAYOUT = ("missing_column", "no_header", "missing_topic")  # codes of logs that a profile does not describe
+# Codes of logs that a profile does not describe.
+UNKNOWN_LAYOUT = ("missing_column", "duplicate_column", "no_header", "missing_topic")
 
 
 class UserError(Exception):

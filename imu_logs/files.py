@@ -52,6 +52,9 @@ KINDS = {
 TEXTS = (".csv", ".txt", ".tsv", ".dat")
 LARGEST_MEMBER = 1 << 32  # bytes
 PRINTABLE = 64  # first bytes of a text
+BINARY = "a binary file of a kind that is not known: export it as text by the program that wrote it"
+CONTROLS = bytes({*range(1, 32)} - {*b"\t\n\v\f\r\x1b"})  # that no text has
+MOST_CONTROLS = 0.01  # of the bytes of a text; a memory card loses NUL bytes
 UTF_16 = "UTF-16 text: save it as UTF-8"
 # A text of less than 1024 bytes that Git LFS keeps in place of a file (git-lfs, docs/spec.md, "The Pointer").
 POINTER, LARGEST_POINTER = b"version https://git-lfs.github.com/spec/", 1024
@@ -78,6 +81,7 @@ FOREIGN = {
     b"\x93NUMPY": "a NumPy array: give it the suffix .npy",
     b"\xfa\xff": "an Xsens binary log: export it as text by MT Manager or MVN",
     b"\xb5b": "a u-blox binary log: export it as text",
+    b"$VN": "VectorNav's ASCII messages, each number with a checksum: export a table by its Control Center",
     b"RIFF": "a video or sound (RIFF), no log",
     b"\xff\xfe": UTF_16,
     b"\xfe\xff": UTF_16,
@@ -99,10 +103,16 @@ def kind_of(start: bytes) -> str:
     return found or SECOND_PLACE.get(start[4:8], "")
 
 
+def is_binary(data: bytes) -> bool:
+    """Return whether bytes are no text, nor UTF-16, nor a text with NUL bytes."""
+    kept = data.replace(b"\0", b"")
+    return len(kept) - len(kept.translate(None, CONTROLS)) > MOST_CONTROLS * len(kept)
+
+
 def is_message_log(path: Path) -> bool:
-    """Return whether a file is a log of messages or arrays, by its suffix; a text with the suffix ``.mat`` is none."""
+    """Return whether a file is a log of messages or arrays, by its suffix; a text with ``.mat`` or ``.bin`` is none."""
     suffix = path.suffix.lower()
-    if suffix == ".mat" and path.is_file():
+    if suffix in (".mat", ".bin") and path.is_file():
         with path.open("rb") as stream:
             start = stream.read(PRINTABLE)
         return (

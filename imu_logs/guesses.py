@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from imu_logs.columns import whole
+from imu_logs.columns import LOW_COST_ERROR, SINCE_1970_S, whole
 from imu_logs.units import COUNTS, FORCE_UNITS, UNITS
 
 if TYPE_CHECKING:
@@ -23,13 +23,12 @@ if TYPE_CHECKING:
 TO_DECIDE = "???"
 OF_SENSOR = "${{sensor.{}.counts_per_unit}}"  # in a profile: a reference to the configuration of the sensor
 MPU60X0_TEMPERATURE = {"counts_per_unit": 340.0, "offset": -12420.2}  # MPU-6000/6050 register map 4.2, 4.18
-LOW_COST_ERROR = 0.12  # bias and scale factor of a low-cost sensor in one position
 MAX_LINE_DEPARTURE = 0.02  # largest departure from a straight line, of the span
 ASSUMED_HZ = 100.0  # if the time is unknown
 TOO_FAST_FOR_RADIANS = 40.0  # rad/s, 2300 deg/s: beyond the range of usual sensors
 BURST_INTERVAL_DIFFERENCE = 0.1  # relative difference of mean and median interval, from which both are stated
+LARGEST_LINEAR = 5.0  # in m/s^2, of a walk
 RATES_HZ = (5.0, 20_000.0)  # sampling rates of inertial sensors
-SINCE_1970_S = (1e9, 4e9)  # 2001 to 2096
 CENTIDEGREES = "cdeg"  # in the name of a table's angle
 TURN_OF = {"deg": 360.0, "rad": 2.0 * np.pi}  # a turn in units of angle
 
@@ -59,8 +58,10 @@ def time_unit(values: Values, stated: str | None, why: str) -> Guess:
     if stated is not None:
         rate = f", {1 / (step * seconds[stated]):.4g} Hz{on_average(seconds[stated])}" if step else ""
         return Guess({"unit": stated}, why + rate, seconds[stated])
-    suits = [u for u, s in seconds.items() if step and RATES_HZ[0] <= 1 / (step * s) <= RATES_HZ[1]]
-    since = [u for u in suits if SINCE_1970_S[0] < float(values[0]) * seconds[u] < SINCE_1970_S[1]]
+    low, high = RATES_HZ
+    suits = [u for u, s in seconds.items() if step and low <= 1 / (step * s) <= high and mean * s * high >= 1]
+    dated = [u for u, s in seconds.items() if step and SINCE_1970_S[0] < float(values[0]) * s < SINCE_1970_S[1]]
+    since = [u for u in dated if u in suits or not suits]
     for unit in since or suits:
         others = [f", or {u} at {1 / (step * seconds[u]):.4g} Hz" for u in suits if u != unit and not since]
         what = "since 1970, in " if since else ""
@@ -114,7 +115,7 @@ class Evidence:
         if whole(rate):
             unknown = {"unit": COUNTS, "counts_per_unit": TO_DECIDE}
             return Guess(unknown, f"whole numbers up to {largest:.4g}: counts of the sensor")
-        return rate_by_size(largest, "nothing shows the unit")
+        return rate_by_size(largest, "nothing shows the unit", guessed=any(c.guessed for c in parts))
 
     def find_encoder(
         self, parts: Sequence[Columns], force: Values | None, rate_dps: Values | None, time_s: Values | None
@@ -131,11 +132,15 @@ def force_by_size(size: float, where: str) -> Guess:
     for unit, gravity in FORCE_UNITS.items():
         if abs(size / gravity - 1) < LOW_COST_ERROR:
             return Guess({"unit": unit}, f"{where}, so {unit}")
-    return Guess({"unit": TO_DECIDE}, f"{where}, which is neither 1 (g), 9.8 (m/s^2) nor 1000 (mg)")
+    no_gravity = "; without gravity (linear acceleration) a log calibrates nothing" * (size < LARGEST_LINEAR)
+    return Guess({"unit": TO_DECIDE}, f"{where}, which is neither 1 (g), 9.8 (m/s^2) nor 1000 (mg){no_gravity}")
 
 
-def rate_by_size(largest: float, otherwise: str) -> Guess:
-    """Return the unit of angular rates that are no whole numbers, by the largest of them."""
-    if largest > TOO_FAST_FOR_RADIANS:
+def rate_by_size(largest: float, otherwise: str, *, guessed: bool) -> Guess:
+    """Return the unit of angular rates that are no whole numbers, by the largest of them.
+
+    ``guessed``: whether the columns may hold something else, such as angles.
+    """
+    if largest > TOO_FAST_FOR_RADIANS and not guessed:
         return Guess({"unit": "deg/s"}, f"up to {largest:.4g}, too fast for rad/s, so deg/s")
     return Guess({"unit": TO_DECIDE}, f"up to {largest:.4g}; {otherwise}: deg/s or rad/s?")

@@ -31,7 +31,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from imu_logs.errors import IngestError
-from imu_logs.files import MESSAGE_FORMATS, is_mat_5
+from imu_logs.files import BINARY, MESSAGE_FORMATS, PRINTABLE, is_mat_5, kind_of
 from imu_logs.log import Note
 from imu_logs.mcap_file import COPY_AGAIN, HEAD, ChannelMessages, McapReader, MessageReader
 from imu_logs.message_decoder import ARRAYS, STATED
@@ -52,7 +52,7 @@ ELEMENT = re.compile(r"(.+)\[(\d+)\]")
 MARKED = 3  # bytes of a DataFlash message before its fields: two marks and its type
 MARKS, FORMAT, LENGTH_OF_FORMAT = b"\xa3\x95", 0x80, 89  # libraries/AP_Logger/LogStructure.h of ArduPilot
 MOST_GARBAGE = 528  # bytes at the end of a log that was written in blocks, as pymavlink allows
-TIME = "TimeUS"
+TIMES_NS = {"TimeUS": 1000, "TimeMS": 1_000_000}  # of DataFlash; in ms before ArduPilot 3.3 of 2015
 TIME_OF_TDMS = "time"
 MIN_SAMPLE_ROWS = 2  # shorter arrays are settings, not samples
 MAX_DIMENSIONS = 3  # dimensions: images, not read
@@ -215,6 +215,10 @@ def _check_chain(content: bytes, log: LogReader) -> None:
         if content[at : at + 2] != MARKS or content[at + 2] not in lengths:
             if len(content) - at < MOST_GARBAGE and at:
                 break
+            if not at and not content.startswith(MARKS[:1]):
+                kind = kind_of(content[:PRINTABLE]) or BINARY
+                message = f"no DataFlash log, as which .bin is read, but {kind} (it starts with {content[:4].hex(' ')})"
+                raise IngestError(message, log.path, code="foreign")
             message = (
                 f"damaged, or no DataFlash log: {content[at : at + MARKED].hex(' ')} begins no message that it defines"
             )
@@ -242,7 +246,8 @@ def _of_dataflash(log: LogReader) -> Iterator[ChannelMessages]:
         starts = np.array(offsets[number], np.int64)
         starts = starts[starts + known.len <= len(data)]
         fields = np.dtype([(n, kinds[c]) for n, c in zip(known.columns, known.format, strict=False)])
-        if not len(starts) or TIME not in known.columns or fields.itemsize + MARKED != known.len:
+        time = next((t for t in TIMES_NS if t in known.columns), None)
+        if not len(starts) or time is None or fields.itemsize + MARKED != known.len:
             continue
         windows = np.lib.stride_tricks.sliding_window_view(data, known.len)[starts, MARKED:]
         table = np.ascontiguousarray(windows).view(fields)[:, 0]
@@ -255,7 +260,7 @@ def _of_dataflash(log: LogReader) -> Iterator[ChannelMessages]:
         instance = table[known.instance_field] if known.instance_field in columns else np.zeros(len(table), np.int64)
         for sensor in np.unique(instance).tolist():
             of_sensor = instance == sensor
-            times = table[TIME][of_sensor].astype(np.int64) * 1000
+            times = table[time][of_sensor].astype(np.int64) * TIMES_NS[time]
             part = {n: c[of_sensor] for n, c in columns.items()}
             yield _of_columns(log, _instance(known.name, sensor), part, units, times)
 
@@ -284,8 +289,14 @@ def _of_telemetry(log: LogReader) -> Iterator[ChannelMessages]:
 
 def _of_arrays(log: LogReader) -> Iterator[ChannelMessages]:
     if log.kind == "NumPy":
-        content = np.load(log.file, allow_pickle=False)
-        arrays = dict(content) if isinstance(content, np.lib.npyio.NpzFile) else {log.file.stem: content}
+        try:
+            content = np.load(log.file, allow_pickle=False)
+            arrays = dict(content) if isinstance(content, np.lib.npyio.NpzFile) else {log.file.stem: content}
+        except ValueError as error:
+            if "allow_pickle" not in str(error):
+                raise
+            message = "holds Python objects, which are not loaded, as they may run code: save arrays of numbers"
+            raise IngestError(message, log.path, code="foreign") from None
         yield from _of_group(log, "", arrays)
     elif log.kind == "TDMS":
         from nptdms import TdmsFile  # noqa: PLC0415  (an extra)

@@ -308,11 +308,18 @@ def topics_of(path: Path) -> list[UnknownLog]:
             if rows.channel not in topics and (log := _topic(reader, rows)) is not None:
                 topics[rows.channel] = log
         listed = [f"{c.topic} ({reader.counts[n]})" for n, c in reader.channels.items()]
-    best = sorted(topics.values(), key=lambda t: (-len(find_columns(t).triads), -len(next(iter(t.numbers.values())))))
+    best = sorted(topics.values(), key=_worth, reverse=True)
     if not best or not find_columns(best[0]).triads:
         message = f"no topic holds the three axes of a sensor; the file has {', '.join(listed) or 'no topics'}"
-        raise IngestError(message, str(path), code="no_table")
+        hint = "name the columns of its arrays in a copy of the profile array_file" if best and best[0].arrays else ""
+        raise IngestError(message, str(path), code="no_table", hint=hint)
     return best
+
+
+def _worth(topic: UnknownLog) -> tuple[int, bool, int]:
+    """Return the sensors of a topic, whether it has a time, as the readings of a simulation have none, and its rows."""
+    columns = find_columns(topic)
+    return len(columns.triads), columns.time is not None, len(next(iter(topic.numbers.values())))
 
 
 def _topic(reader: MessageReader, rows: ChannelMessages) -> UnknownLog | None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 import textwrap
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
@@ -45,9 +45,10 @@ if TYPE_CHECKING:
     from imu_logs.log import Values
 
 
-UNITS_OF = {"accelerometer": ("g", "mg", "ug", "m/s^2"), "gyroscope": ("deg/s", "mdps", "rad/s", "mrad/s")}
+UNITS_OF = {"accelerometer": ("g", "mg", "ug", "m/s^2", "mm/s^2"), "gyroscope": ("deg/s", "mdps", "rad/s", "mrad/s")}
 LEAST_GRAVITY = 0.3  # of gravity, for the median |a| of a log; quality_flags refuses less
 FEWEST_LABELS, MOST_LABELS = 3, 4  # two texts may be states of the logger; labels that a remark names
+SAME_UNIT = 0.2  # relative: a low-cost sensor in few positions, and moves by hand
 SEARCHED_BYTES = 1 << 25  # of a text log, for its layout
 # Topics of autopilots (PX4 uORB, ArduPilot log messages) to the shipped profiles.
 SHIPPED = {
@@ -213,13 +214,19 @@ def _fill_in(proposal: Proposal, other: Proposal) -> None:
 
 def _proposal(parts: list[Columns], evidence: Evidence) -> Proposal:
     logs = [columns.log for columns in parts]
-    seen = [{key: _described(log.numbers.get(i)) for i, key in enumerate(log.keys)} for log in logs]
+    seen = [
+        {key: f"{name}: " * (log.named and isinstance(key, int)) + _described(log.numbers.get(i))
+         for i, (key, name) in enumerate(zip(log.keys, log.names, strict=True))}
+        for log in logs
+    ]  # fmt: skip
     first = logs[0]
     proposal = Proposal([log.path for log in logs], logs, {**first.csv}, [{} for _ in parts], {**first.evidence}, seen)
     time_s = _time(parts, proposal)
     force = _readings("accelerometer", parts)
     if force is not None:
         guess = evidence.force_unit(force, time_s)
+        if any(p.guessed for p in parts) and guess.entry["unit"] in ("mg", "ug", "mm/s^2"):
+            guess = replace(guess, entry={"unit": TO_DECIDE}, evidence=f"{guess.evidence} if it is a specific force")
         _add("accelerometer", parts, proposal, guess)
         proposal.remarks += evidence.remarks(guess)
         force = force - guess.centre
@@ -255,8 +262,9 @@ def _labels(log: UnknownLog) -> list[str]:
         if FEWEST_LABELS <= len(labels) == len(set(labels)) and len(texts) >= SHORTEST_PART * len(labels):
             named = ", ".join(labels[:MOST_LABELS]) + " .." * (len(labels) > MOST_LABELS)
             found.append(
-                f"column {log.names[index]} labels {len(labels)} parts ({named}), which may not follow each other in "
-                "time: give each rest and turn as a window or a separate file, see docs/record.md#parts"
+                f"column {log.names[index].removeprefix('column ')} labels {len(labels)} parts ({named}), which may "
+                "not follow each other in time: give each rest and turn as a window or a separate file, see "
+                "docs/record.md#parts"
             )
     return found
 
@@ -365,8 +373,16 @@ def _add(sensor: str, parts: list[Columns], proposal: Proposal, guess: Guess) ->
         proposal.columns[place][channel] = {"column": log.keys[index], **entry}
         if entry is not guess.entry:
             proposal.evidence[sensor] = f"{why}; {guess.evidence}"
-            if guess.entry["unit"] not in (stated, TO_DECIDE):
+            if _contradicts(guess.entry, channel, str(stated)):
                 proposal.remarks.append(f"{log.names[index]}: {why}, and yet {guess.evidence}")
+
+
+def _contradicts(entry: Mapping[str, Any], channel: str, stated: str) -> bool:
+    """Return whether a guess is another unit than the name states; counts may be that unit in whole numbers."""
+    if entry["unit"] != COUNTS:
+        return entry["unit"] not in (stated, TO_DECIDE)
+    counts, (multiplier, divisor) = entry["counts_per_unit"], UNITS[channel][stated]
+    return isinstance(counts, float) and abs(counts * multiplier / divisor - 1.0) > SAME_UNIT
 
 
 def _without_gravity(log: UnknownLog, triad: tuple[int, int, int], unit: str | None) -> str:

@@ -65,7 +65,8 @@ def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[
     could contain them under other names: then the log has one sensor. ``below``: the next lines, by their number, which
     are searched for a header at another place.
     """
-    twice = sorted({n for n in names if n and names.count(n) > 1})
+    numbers = bool(settings.header) and all(NUMBER.fullmatch(n) for name in names for n in re.split(r"[;\t| ]+", name))
+    twice = [] if numbers else sorted({n for n in names if n and names.count(n) > 1})
     others = [f"column name {', '.join(twice)} occurs more than once in the header"] if twice else []
     found: list[tuple[Column, int]] = []
     lacking: list[Column] = []
@@ -79,9 +80,6 @@ def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[
     absent = _channels_of_absent_sensor(lacking, found, len(names))
     missing = [str(column.column) for column in lacking if column.channel not in absent]
     if missing:
-        numbers = bool(settings.header) and all(
-            NUMBER.fullmatch(n) for name in names for n in re.split(r"[;\t| ]+", name)
-        )
         near = {m: difflib.get_close_matches(m, names, 1) for m in missing}
         wanted = ", ".join(f"{m} (nearest: {n[0]})" if n else m for m, n in near.items())
         others = [f"column {wanted} missing; found {', '.join(names)[:300]}{other_separator(names)}", *others]

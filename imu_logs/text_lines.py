@@ -17,7 +17,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 
 from imu_logs.errors import IngestError
-from imu_logs.files import UTF_16, refuse_foreign
+from imu_logs.files import BINARY, UTF_16, is_binary, refuse_foreign
 from imu_logs.log import Note
 from imu_logs.profile import AUTO, COMMENTED, DROP, WHITESPACE
 
@@ -33,6 +33,7 @@ NEWLINE = ord("\n")
 BOM = b"\xef\xbb\xbf"
 # A line, a carriage return without a newline, and (only as look-ahead) the line after it.
 BROKEN = re.compile(rb"([^\r\n]+)\r(?!\n)(?=([^\r\n]+))")
+BLANK_LINE = re.compile(rb"^[ \t]+$", re.MULTILINE)
 DELIMITERS = ",;\t|"
 ANY_DELIMITER = re.compile(rb"[,;\t|]| +")
 
@@ -182,11 +183,12 @@ class TextLog:
         if self.settings.delimiter == WHITESPACE:
             data = _single_blanks(data)
             empty = b"\n\n" in data or data.startswith(b"\n")
+        empty = empty or (b" \n" in data and BLANK_LINE.search(data) is not None)
         if empty or (comment is not None and comment.encode() in data):
             parts = data.split(b"\n")[:-1]
             is_comment = np.array([self._is_comment(part) for part in parts], bool)
             self.comments += lines[is_comment].tolist()
-            keep = ~is_comment & np.array([bool(part) for part in parts], bool)
+            keep = ~is_comment & np.array([bool(part.strip()) for part in parts], bool)
             data = b"".join(part + b"\n" for part, kept in zip(parts, keep.tolist(), strict=True) if kept)
             lines = lines[keep]
         return data, lines
@@ -241,6 +243,8 @@ class TextLog:
         kept = data.rstrip(b"\0")
         first = max(kept.find(b"\0"), 0)
         inside = b"\0" in kept
+        if is_binary(kept):
+            raise IngestError(f"{BINARY} (it starts with the bytes {data[:4].hex(' ')})", self.path, code="foreign")
         if inside and data[1::2].count(0) > len(data) // 8 > data[::2].count(0):
             raise IngestError(f"not a text log but {UTF_16}", self.path, code="utf16")
         if (not kept and position == 0) or (inside and self.settings.bad_rows != DROP):

@@ -29,7 +29,10 @@ TABLE_CHANNELS = ("table_angle", "table_rate", *ATTITUDE)
 TRIADS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE}
 
 # Per quantity: unit to (multiplier, divisor); two numbers, because 1001.5 mg / 1000 is exact and times 0.001 is not.
-_FORCE = {"g": (1.0, 1.0), "mg": (1.0, 1000.0), "ug": (1.0, 1e6), "m/s^2": (1.0, STANDARD_GRAVITY), COUNTS: (1.0, 1.0)}
+_FORCE = {
+    "g": (1.0, 1.0), "mg": (1.0, 1000.0), "ug": (1.0, 1e6), "m/s^2": (1.0, STANDARD_GRAVITY),
+    "mm/s^2": (1.0, STANDARD_GRAVITY * 1000.0), COUNTS: (1.0, 1.0),
+}  # fmt: skip
 _RATE = {
     "deg/s": (1.0, 1.0),
     "mdps": (1.0, 1000.0),
@@ -40,7 +43,7 @@ _RATE = {
 _ANGLE = {"deg": (1.0, 1.0), "rad": (DEGREES, 1.0), COUNTS: (1.0, 1.0)}
 _TEMPERATURE = {"degC": (1.0, 1.0), COUNTS: (1.0, 1.0)}
 _RATIO = {"1": (1.0, 1.0)}
-FORCE_UNITS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "mg": 1000.0, "ug": 1e6}  # how many are one g
+FORCE_UNITS = {unit: divisor for unit, (_, divisor) in _FORCE.items() if unit != COUNTS}  # how many are one g
 _TIME = {"s": (1e9, 1.0), "ms": (1e6, 1.0), "us": (1e3, 1.0), "ns": (1.0, 1.0)}
 
 UNITS: dict[str, dict[str, tuple[float, float]]] = {
@@ -67,6 +70,7 @@ CANONICAL = {
 
 # Spellings of units in the names of columns, lower case and without blanks, to the names used here.
 SPELLINGS = {
+    "mm/s^2": "mm/s^2", "mm/s2": "mm/s^2",
     "g": "g", "mg": "mg", "m/s^2": "m/s^2", "m/s2": "m/s^2", "m/s²": "m/s^2", "ms^-2": "m/s^2", "m/s/s": "m/s^2",
     "mps2": "m/s^2", "deg/s": "deg/s", "°/s": "deg/s", "dps": "deg/s", "degs/s": "deg/s", "rad/s": "rad/s",
     "rads/s": "rad/s", "s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us", "μs": "us", "ns": "ns",

@@ -262,7 +262,11 @@ def change(ingest: dict[str, Any], key: str, value: Any) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("csv/columns/accel_x/unit", "m/s2", "columns.accel_x.unit is 'm/s2'; allowed are g, mg, ug, m/s^2, counts"),
+        (
+            "csv/columns/accel_x/unit",
+            "m/s2",
+            "columns.accel_x.unit is 'm/s2'; allowed are g, mg, ug, m/s^2, mm/s^2, counts",
+        ),
         ("csv/columns/accel_x/unit", None, "columns.accel_x.unit is None; allowed are g, mg"),
         ("csv/columns/gyro_x/unit", "g", "columns.gyro_x.unit is 'g'; allowed are deg/s, mdps, mrad/s, rad/s, counts"),
         ("csv/columns/accel_x/unit", "counts", "accel_x.counts_per_unit is None; counts need a number"),

@@ -16,11 +16,10 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from imu_logs import proposal
-from imu_logs.columns import NO_SENSOR, OFFSETS, stated_unit, whole, words_of
+from imu_logs.columns import LOW_COST_ERROR, NO_SENSOR, OFFSETS, stated_unit, whole, words_of
 from imu_logs.guesses import (
     ASSUMED_HZ,
     CENTIDEGREES,
-    LOW_COST_ERROR,
     OF_SENSOR,
     TO_DECIDE,
     TURN_OF,
@@ -31,7 +30,7 @@ from imu_logs.guesses import (
     rate_by_size,
     unit_of_turn,
 )
-from imu_logs.units import COUNTS, DEGREES, UNITS
+from imu_logs.units import COUNTS, DEGREES, FORCE_UNITS, UNITS
 from imu_logs.yaml_file import read_yaml
 from pipeline.core.files import CONFIGS
 from pipeline.ingest.gravity_rotation import MoveByHand, interval_of, misfit_deg, moves_of, rests_of
@@ -51,6 +50,7 @@ CLOSE_BY_TURNS = 0.2  # bias and scale factor of both sensors, in few moves
 USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)  # 2, 4, 8, 16 g in 16 bits, and 12 or 10 bits
 # 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch); whole mdps (drivers of STMicroelectronics).
 USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2, 1000.0)
+LARGEST_COUNT = 2.0**23  # of converters with 24 bits
 COUNT_GRID = np.geomspace(1.0, 1000.0, 481)  # grid of counts per deg/s, in steps of 1.4 %
 # A known factor is taken in place of the fitted one up to this misfit, or times that of the fitted one: a scale factor
 # that is off by 3 % (MPU-6050) turns gravity by 5 deg too much in half a turn.
@@ -100,12 +100,15 @@ def _counts_per_g(rests: int, centre: Values, radius: float, size: float, where:
         entry = {"unit": COUNTS, "counts_per_unit": float(f"{radius:.3g}"), "offset": offset}
         spread = f"{rests} rests lie on a sphere of radius {radius:.0f} about {middle:.0f}"
         return Guess(entry, f"whole numbers; {spread}, so counts with an offset of {offset:.0f}")
-    usual = min(USUAL_COUNTS_PER_G, key=lambda c: abs(np.log(size / c)))
+    usual = min((*USUAL_COUNTS_PER_G, FORCE_UNITS["mg"]), key=lambda c: abs(np.log(size / c)))
+    if usual == FORCE_UNITS["mg"] and abs(size / usual - 1) < LOW_COST_ERROR:
+        return Guess({"unit": "mg"}, f"whole numbers, {where}, so mg, or counts, 1024 a g")
     if abs(size / usual - 1) < LOW_COST_ERROR:
         entry = {"unit": COUNTS, "counts_per_unit": usual}
         return Guess(entry, f"whole numbers, {where}: counts, near the usual {usual:g} a g")
-    if abs(size / 1000.0 - 1) < LOW_COST_ERROR:
-        return Guess({"unit": "mg"}, f"{where}, so mg")
+    if size > LARGEST_COUNT:
+        entry = {"unit": COUNTS, "counts_per_unit": TO_DECIDE}
+        return Guess(entry, f"whole numbers, {where}: more than 24 bits; did the numbers lose their decimal separator?")
     entry = {"unit": COUNTS, "counts_per_unit": float(f"{size:.3g}")}
     return Guess(entry, f"whole numbers, {where}: counts, {size:.3g} a g (no usual number)")
 
@@ -118,11 +121,12 @@ def sphere(points: Values) -> tuple[Values, float]:
     return centre, float(np.sqrt(max(solution[3] + centre @ centre, 0.0)))
 
 
-def rate_unit(rate: Values, moves: Sequence[MoveByHand], why_none: str, *, timed: bool) -> Guess:
+def rate_unit(rate: Values, moves: Sequence[MoveByHand], why_none: str, *, timed: bool, guessed: bool) -> Guess:
     """Return the unit of (n, 3) angular rates from the ``moves`` between rests in which gravity turns.
 
     ``why_none``: the reason if there are no moves. Without a time (``timed`` False) an interval of 1 / ``ASSUMED_HZ``
-    is assumed, and only the product of scale and sampling rate can be determined.
+    is assumed, and only the product of scale and sampling rate can be determined. ``guessed``: no name says that
+    they are rates.
     """
     largest = float(np.abs(rate - np.median(rate, axis=0)).max())
     if whole(rate):
@@ -137,7 +141,7 @@ def rate_unit(rate: Values, moves: Sequence[MoveByHand], why_none: str, *, timed
         if misfit[best] > CONVINCING_DEG:
             return Guess({"unit": TO_DECIDE}, f"{text}, and no better otherwise: not convincing")
         return Guess({"unit": unit}, f"{text} (the other unit misses by {misfit[1 - best]:.0f} deg)")
-    return rate_by_size(largest, why_none or "the time is not known")
+    return rate_by_size(largest, why_none or "the time is not known", guessed=guessed)
 
 
 def rate_unit_by_table(rate: Values, table_rate: Values) -> Guess | None:
@@ -372,8 +376,9 @@ class ByMotion(Evidence):
         elif force is not None:
             moves = moves_of(force, rate, time_s if time_s is not None else np.arange(len(rate)) / ASSUMED_HZ)
             why_none = "" if moves else "no move between rests rotates gravity, which would show the unit"
-        by_table = unit_by_table(next(c for c in parts if "gyroscope" in c.triads), rate, time_s)
-        guess = by_table or rate_unit(rate, moves, why_none, timed=time_s is not None)
+        columns = next(c for c in parts if "gyroscope" in c.triads)
+        guess = unit_by_table(columns, rate, time_s)
+        guess = guess or rate_unit(rate, moves, why_none, timed=time_s is not None, guessed=columns.guessed)
         if guess.entry["unit"] == COUNTS and guess.entry["counts_per_unit"] == TO_DECIDE:
             return counts_of_sensor(guess, "gyroscope", self.model)
         return guess
