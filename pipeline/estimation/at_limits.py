@@ -28,7 +28,7 @@ import numpy as np
 
 from pipeline.core.records import BASE, BIAS, matrix_of
 from pipeline.estimation.candidates import limits_of
-from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.design import EffectColumns, columns_of_samples, joined_motions
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.multi_position.model import motion_of
 from pipeline.physics.effects import catalogue, effect
@@ -79,17 +79,17 @@ def changes_on_table(
 ) -> dict[str, Values]:
     """Return the change of bias and matrix by each effect at its limits, (12, p), of a fit on a table."""
     found: dict[str, Values] = {}
-    motions = _centred(reference.motions)
-    edges = np.cumsum([0, *(len(motion.time) for motion in motions)])
-    for this, start, limits in limited_effects(reference.sensor, modelled, data_sheet):
+    sensor, K, motions = reference.sensor, reference.K, _centred(reference.motions)
+    joined = joined_motions(motions)
+    for this, start, limits in limited_effects(sensor, modelled, data_sheet):
         if not all(this.available(motion) for motion in motions):
             continue
-        change = np.zeros((fit.parameters, len(limits)))
-        for motion, first, last in zip(motions, edges[:-1], edges[1:], strict=True):
-            columns = this.columns(reference.sensor, motion, reference.K, start)
-            for J, A, z in zip(fit.derivative, fit.weights, columns.transpose(1, 0, 2), strict=True):
-                change += J @ (A[:, first:last] @ z)
-        _keep_larger(found, this.name, (change * limits)[BASE])
+        if this.of_samples:
+            columns = columns_of_samples(EffectColumns(this, start, full=True), sensor, joined, K)
+        else:
+            columns = np.concatenate([this.columns(sensor, motion, K, start) for motion in motions])
+        pairs = zip(fit.derivative, fit.weights, columns.transpose(1, 0, 2), strict=True)
+        _keep_larger(found, this.name, (sum(J @ (A @ z) for J, A, z in pairs) * limits)[BASE])
     return found
 
 

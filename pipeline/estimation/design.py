@@ -122,7 +122,7 @@ def motions_of(part: RecordingRows, terms: Sequence[EffectColumns]) -> list[Moti
     return [*(everything if own is None else true_motion(part, terms, own) for own in acting), everything]
 
 
-def _joined(motions: Sequence[Motion]) -> list[tuple[Motion, list[Motion]]]:
+def joined_motions(motions: Sequence[Motion]) -> list[tuple[Motion, list[Motion]]]:
     """Return the motions of successive recordings that hold the same signals as one, each with those that it joins."""
     joined = []
     for held, group in groupby(
@@ -137,7 +137,9 @@ def _joined(motions: Sequence[Motion]) -> list[tuple[Motion, list[Motion]]]:
     return joined
 
 
-def _of_samples(term: EffectColumns, sensor: str, joined: Sequence[tuple[Motion, list[Motion]]], K: Values) -> Values:
+def columns_of_samples(
+    term: EffectColumns, sensor: str, joined: Sequence[tuple[Motion, list[Motion]]], K: Values
+) -> Values:
     """Return the columns of a term whose regressors at a sample depend on the motion there alone."""
     columns = []
     for motion, members in joined:
@@ -284,8 +286,8 @@ class Design:
                 columns = np.concatenate([term.regressors(sensor, motion, K, every) for motion, every in pairs])
             else:
                 key = tuple(map(id, motions))
-                known[key] = known.get(key) or _joined(motions)
-                columns = _of_samples(term, sensor, known[key], K)
+                known[key] = known.get(key) or joined_motions(motions)
+                columns = columns_of_samples(term, sensor, known[key], K)
             for c, place in enumerate(places):
                 A[:, place] = columns if term.layout() == Layout.EVERY_AXIS else columns[:, c]
 

@@ -92,6 +92,7 @@ class SetSearch:
     ) -> None:
         self.problem, self.required = problem, frozenset(required)
         self.pool: dict[EffectSet, Found] = {}
+        self._known: dict[frozenset[tuple[str, Pick]], dict[str, Values]] = {}  # log E with each effect, given picks
         self._extended: set[EffectSet] = set()
         first = [*dict.fromkeys([self.required, *(frozenset(seed) | self.required for seed in seeds)])]
         self._prune(first)
@@ -167,6 +168,7 @@ class SetSearch:
         conditionals = given.conditionals([*self.problem.versions]) if given else []
         for names, evidence in zip(new, conditionals, strict=True):
             parent = self.pool[names]
+            self._known[frozenset(parent.picks.items())] = evidence
             for name in self._allowed(names):
                 child, total = names | {name}, float(np.logaddexp.reduce(evidence[name], axis=None))
                 score, known = total + parent.spread + ODDS * len(child), self.pool.get(child)
@@ -187,7 +189,10 @@ class SetSearch:
             before, spread = dict(picks), 0.0
             for name in picks:
                 others = {n: pick for n, pick in picks.items() if n != name}
-                evidence = Given(self.problem, [others]).conditionals([name])[0][name]
+                known_of = self._known.setdefault(frozenset(others.items()), {})
+                if name not in known_of:
+                    known_of |= Given(self.problem, [others]).conditionals([name])[0]
+                evidence = known_of[name]
                 score, picks[name] = _largest(evidence)
                 spread += float(np.logaddexp.reduce(evidence, axis=None)) - score
             if picks == before:

@@ -101,6 +101,7 @@ class Ranking:
             return np.concatenate([*parts, columns[:, :, -1:]], axis=2)
 
         self.products: Values = reduced(reduced(self.projected).transpose(0, 2, 1))
+        self._with: dict[tuple[int, ...], Values] = {}  # log L of selected candidates and one more, from ``scores``
 
     def indices(self, name: str) -> list[int]:
         """Return the indices of the candidates of an effect that the motion excites."""
@@ -125,6 +126,8 @@ class Ranking:
 
     def log_likelihoods(self, selected: Sequence[int]) -> Values:
         """Return log L of base and selected candidates at each noise setting, the first white noise alone."""
+        if (known := self._with.get(tuple(selected))) is not None:
+            return known
         place = np.concatenate([*[self.places[j] for j in selected], [-1]]).astype(int)
         rest = without(self.products[:, place[:, None], place], np.arange(len(place) - 1))
         return self.log_likelihood(rest[:, -1, -1])
@@ -147,7 +150,10 @@ class Ranking:
         for j, term in enumerate(self.candidates):
             if len(self.places[j]) and term.effect.name not in names:
                 by_size.setdefault(len(self.places[j]), []).append(j)
-        scores = {j: s for members in by_size.values() for j, s in self._scored(members, products, before, limits)}
+        scores = {}
+        for members in by_size.values():
+            for j, score, likelihoods in self._scored(members, products, before, limits):
+                scores[j], self._with[*selected, j] = score, likelihoods
         best: dict[str, Score] = {}
         for _, score in sorted(scores.items()):
             if score.name not in best or score.delta_bic > best[score.name].delta_bic:
@@ -156,8 +162,8 @@ class Ranking:
 
     def _scored(
         self, members: Sequence[int], products: Values, before: float, limits: dict[str, Values]
-    ) -> Iterator[tuple[int, Score]]:
-        """Yield the index and the score of candidates with equal numbers of directions."""
+    ) -> Iterator[tuple[int, Score, Values]]:
+        """Yield index, score and log likelihoods of candidates with equal numbers of directions."""
         places = [slice(self.places[j][0], self.places[j][-1] + 1) for j in members]
         inner = np.stack([products[:, at, at] for at in places])
         cross = np.stack([products[:, at, -1] for at in places])
@@ -188,7 +194,7 @@ class Ranking:
                 plausible=bool(np.all(np.abs(values) - 2.0 * uncertainty <= limits.get(this.name, np.inf))),
                 drop=float(2.0 * signal @ cross[i, 0] - signal @ inner[i, 0] @ signal),
             )
-            yield j, score
+            yield j, score, likelihood[i]
 
     def _estimate(self, j: int, solved: Values, inner: Values, rss: float) -> tuple[Values, Values]:
         """Return the parameters and their standard uncertainties from the reduced coefficients."""

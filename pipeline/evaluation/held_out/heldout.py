@@ -260,7 +260,9 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
         calibrated.append(recording.with_readings(flags=np.where(known, flags, flags | STUCK), **values))
     at_rest = [r for r in case.recordings if r.role == "static"]
     table = settings.table.replaced(**dict.fromkeys(bench_priors().values()))
-    plain = settings.replaced(table=table, uncertainty=Uncertainty(monte_carlo=0))
+    without_limits = settings.sensor.of(sensor).replaced(effects={})
+    own = settings.sensor.replaced(**{sensor: without_limits})  # for the limits of effects, which E has no part in
+    plain = settings.replaced(sensor=own, table=table, uncertainty=Uncertainty(monte_carlo=0))
     held_out_and_static = UnitRecordings([*calibrated, *at_rest], {sensor: case.noise})
     try:
         fit = reference_least_squares.fit(sensor, held_out_and_static, None, plain)
