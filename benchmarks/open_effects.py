@@ -19,7 +19,7 @@ import numpy as np
 
 from pipeline.app.one_unit import unit_of_recordings, unit_row
 from pipeline.core.records import SENSORS
-from pipeline.estimation.at_limits import limited_effects
+from pipeline.estimation.uncertainty_budget import limited_effects
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 

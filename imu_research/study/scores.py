@@ -18,7 +18,7 @@ import pandas as pd
 import scipy
 
 from pipeline.core.verdicts import Verdict
-from pipeline.estimation.free_curves import OTHER_PREFIX
+from pipeline.estimation.design import OTHER_PREFIX
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW
 from pipeline.output.pages.chart import Dots, Figure, LineMark, Panel, chart
 from pipeline.physics.effects import effect

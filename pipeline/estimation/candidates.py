@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.design import EffectColumns, NormalPrior, placed
-from pipeline.estimation.free_curves import MAX_BEND_SHARE_OF_ROOM, Bend
+from pipeline.estimation.design import MAX_BEND_SHARE_OF_ROOM, Bend, EffectColumns, NormalPrior, placed
 from pipeline.estimation.gates import possible
 from pipeline.physics.effects import catalogue, effect, stated_priors
 from pipeline.physics.effects.base import parameter_limits

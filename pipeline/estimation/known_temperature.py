@@ -3,7 +3,7 @@
     z = b_T (T - 25 degC) + k_T (T - 25 degC) u
 
 are the effects ``bias_temperature`` and ``scale_factor_temperature``, by axis, with the truth u. They are subtracted
-from the readings of the stages after this one (``pipeline.estimation.known_effects``). Of the settings
+from the readings of the stages after this one (``pipeline.estimation.stages``). Of the settings
 ``sensor.<sensor>.known_temperature``, ``bias`` is b_T, in g or deg/s per degC. ``scale_factor`` is the relative change
 s per degC of the scale factor against that at ``reference_degc`` T_r; with a scale factor of about 1,
 
@@ -20,8 +20,7 @@ import numpy as np
 
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import Estimate, FittedEffect, SensorCalibration, StageResult
-from pipeline.estimation.known_effects import known_effects
-from pipeline.estimation.stages import FitStage
+from pipeline.estimation.stages import FitStage, known_effects
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from unit_settings import settings_of
 
+from pipeline.app.steps.calibration import frame_uncertainty
 from pipeline.core.records import FittedEffect, Recording, SensorCalibration
-from pipeline.estimation.frame import frame_uncertainty
 from pipeline.physics.calibration_file import OF_FRAME, beyond_uncertainty, frame_words
 from pipeline.physics.kinematics import turn_by_vector
 

@@ -13,6 +13,7 @@ from scipy.special import logsumexp
 
 from pipeline.core.records import Motion
 from pipeline.estimation.candidates import time_constants
+from pipeline.estimation.design import BEND, free_curves
 from pipeline.estimation.evidence import (
     LIMIT_SCALES,
     SCALE_PRIOR,
@@ -22,7 +23,6 @@ from pipeline.estimation.evidence import (
     _explained,
     excited,
 )
-from pipeline.estimation.free_curves import BEND, free_curves
 from pipeline.estimation.posterior import ODDS, UPPER_LIMIT_SHARE, Answers, SetSearch, answers, quantiles
 from pipeline.estimation.ranking import without
 

@@ -34,7 +34,7 @@ import scipy
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gates import min_gain
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
-from pipeline.estimation.multi_position.likelihood import log_likelihood, project_out
+from pipeline.estimation.multi_position.fit import log_likelihood, project_out
 from pipeline.estimation.multi_position.model import NoiseHypothesis
 from pipeline.estimation.ranking import UNIT_COLUMN_RIDGE
 from pipeline.estimation.selection import DELAYS, LOOK_ALIKE_SHARE, Selection

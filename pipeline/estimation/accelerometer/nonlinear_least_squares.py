@@ -42,7 +42,6 @@ from pipeline.core.records import (
     base_values,
     coverage_factor,
 )
-from pipeline.estimation.at_limits import changes_on_table
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import WHITE_SETTING, WanderPrior
 from pipeline.estimation.least_squares import ScaledColumns
@@ -72,6 +71,7 @@ from pipeline.estimation.stages import FitStage
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_turns, used_motions
 from pipeline.estimation.uncertainty_budget import (
+    changes_on_table,
     combined,
     gravity_line,
     noise_contribution,

@@ -36,12 +36,12 @@ from pipeline.estimation.engine import draw_normal
 from pipeline.estimation.least_squares import cholesky
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, SMALLEST_NOISE, white_of
 from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, turns_of
-from pipeline.estimation.multi_position.limits import limit_block
 from pipeline.estimation.multi_position.model import (
     EquationBlock,
     Equations,
     State,
     effect_readings,
+    limit_block,
     motion_of,
     stacked,
 )

@@ -17,7 +17,7 @@ q   : standard deviation of that bias over white noise
 k   : at least 1: scatter beyond the hypotheses of a grid (``likelihood``)
 
 A parameter that the recordings do not determine has a separate equation, a pseudo-observation of the value of an ideal
-sensor with the standard uncertainty u by the sensor file's limit (``limits``). ``between`` is the standard
+sensor with the standard uncertainty u by the sensor file's limit. ``between`` is the standard
 deviation of the bias from one recording to the next, over white noise: it adds ``between^2 H J H^T`` to S, where J is 1
 for two stretches of one recording and else 0.
 
@@ -35,17 +35,19 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import scipy
 
-from pipeline.core.records import BIAS, Index, Mask, Motion, Noise, Values, matrix_of
+from pipeline.core.records import BIAS, Index, Mask, Motion, Noise, Values, base_values, matrix_of
 from pipeline.estimation import design
 from pipeline.estimation.gauss_markov import NO_INSTABILITY_ODDS, Setting, WanderPrior, block_covariance, selection_grid
 from pipeline.estimation.least_squares import cholesky
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
+    from imu_logs.log import Values
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
+
 
 Model: TypeAlias = "AccelerometerModel | GyroscopeModel"
 
@@ -307,3 +309,23 @@ def prior_hypotheses(prior: WanderPrior, white: float, kinds: int) -> list[Noise
     ]
     steady_moves = [h for h in hypotheses if kinds > 1 and h.scatter[1] in {START_SCATTERS[0], START_SCATTERS[2]}]
     return hypotheses + [replace(h, direction=c) for h in steady_moves for c in START_SCATTERS[2:]]
+
+
+# Parameters that are 1 in an ideal sensor; all others are 0.
+ONE = {f"{prefix}{axis}" for axis in "xyz" for prefix in ("scale_factor_", f"matrix_{axis}")}
+
+
+def limit_block(known: Mapping[str, float], columns: Values, state: State, unit: float = 1.0) -> EquationBlock:
+    """Return the pseudo-observations of parameters that the sensor file's limits alone determine.
+
+    ``known``: name to standard uncertainty; ``columns``: (k, 12), derivative of each by bias and matrix; ``unit``:
+    factor of the errors that are reported.
+    """
+    u = np.array(list(known.values()))
+    ideal = np.array([float(name in ONE) for name in known])
+    return EquationBlock(
+        (ideal - columns @ base_values(state.bias, state.matrix)) / u,
+        columns / u[:, None],
+        lambda term: np.zeros((len(u), len(term.values))),
+        unit * u,
+    )

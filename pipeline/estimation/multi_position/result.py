@@ -17,7 +17,6 @@ import numpy as np
 import scipy
 
 from pipeline.core.records import Contribution, Recording, SensorCalibration, StageResult, Values, base_values
-from pipeline.estimation.at_limits import changes_by_hand, changes_through_gravity, gain_of
 from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.least_squares import convergence_evidence
 from pipeline.estimation.monte_carlo import quadratic_results, with_trials
@@ -32,9 +31,12 @@ from pipeline.estimation.table_errors import TIME_BASE
 from pipeline.estimation.uncertainty_budget import (
     TEMPERATURE,
     base_parameters,
+    changes_by_hand,
+    changes_through_gravity,
     clock_contribution,
     combined,
     effect_parameters,
+    gain_of,
     gravity_line,
     limit_contribution,
     scatter_contribution,

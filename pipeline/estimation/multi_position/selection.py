@@ -25,8 +25,15 @@ from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.evidence import CandidateProblem, linear_problem
 from pipeline.estimation.gates import MIN_DELTA_BIC, passes
 from pipeline.estimation.gauss_markov import random_walks
-from pipeline.estimation.multi_position.fit import COMPARED_STEP, SMALL_LAST_STEP, FitByHand, fit
-from pipeline.estimation.multi_position.likelihood import CEILING_TO, MIN_NEW_NORM_SHARE, project_out
+from pipeline.estimation.multi_position.fit import (
+    CEILING_TO,
+    COMPARED_STEP,
+    MIN_NEW_NORM_SHARE,
+    SMALL_LAST_STEP,
+    FitByHand,
+    fit,
+    project_out,
+)
 from pipeline.estimation.multi_position.model import Model, NoiseHypothesis, State, selection_hypotheses
 from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import Score, without

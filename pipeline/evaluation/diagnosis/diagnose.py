@@ -24,8 +24,8 @@ from pipeline.core.records import (
 from pipeline.core.settings import Uncertainty
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
+from pipeline.estimation.design import OTHER_PREFIX
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
-from pipeline.estimation.free_curves import OTHER_PREFIX
 from pipeline.estimation.noise import with_noises
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.stages import last_fit

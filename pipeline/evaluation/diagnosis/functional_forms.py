@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.free_curves import CURVE_DEGREE
+from pipeline.estimation.design import CURVE_DEGREE
 from pipeline.evaluation.diagnosis.words import listed
 from pipeline.physics.effects.base import truth, unit_of
 from pipeline.physics.formula import parse

@@ -29,8 +29,15 @@ from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
 from pipeline.estimation.least_squares import ScaledColumns, cholesky
 from pipeline.estimation.multi_position.effects import model_of
-from pipeline.estimation.multi_position.fit import COMPARED_STEP, FitByHand, fit
-from pipeline.estimation.multi_position.likelihood import CEILING_TO, MIN_NEW_NORM_SHARE, log_likelihoods, project_out
+from pipeline.estimation.multi_position.fit import (
+    CEILING_TO,
+    COMPARED_STEP,
+    MIN_NEW_NORM_SHARE,
+    FitByHand,
+    fit,
+    log_likelihoods,
+    project_out,
+)
 from pipeline.estimation.multi_position.model import NoiseHypothesis
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import SelectionByHand, posterior

@@ -29,7 +29,7 @@ import scipy
 from numpy.polynomial.chebyshev import chebvander
 
 from pipeline.core.records import Dependence
-from pipeline.estimation.free_curves import CURVE_DEGREE, MAX_CURVE_CYCLES
+from pipeline.estimation.design import CURVE_DEGREE, MAX_CURVE_CYCLES
 from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import GaussMarkov, selection_grid
 from pipeline.evaluation.diagnosis.functional_forms import Span, available_signals, signals_of

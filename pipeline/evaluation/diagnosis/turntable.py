@@ -15,10 +15,10 @@ from pipeline.core.errors import ConvergenceError
 from pipeline.core.records import Noise, SelectionErrors, SensorCalibration, TableEvidence
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import turns_of
-from pipeline.estimation.free_curves import free_curves
+from pipeline.estimation.design import free_curves
 from pipeline.estimation.generalized_least_squares import JointFit, calibration_of, fit_in_mean_frame, fit_terms
 from pipeline.estimation.observations import observe
-from pipeline.estimation.posterior_turns import posterior
+from pipeline.estimation.posterior import posterior
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, why_not_suggested

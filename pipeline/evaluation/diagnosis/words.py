@@ -12,7 +12,7 @@ from pipeline.core.compiled_templates import CompiledTemplates
 from pipeline.core.records import Answer
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed
-from pipeline.estimation.free_curves import OTHER_PREFIX
+from pipeline.estimation.design import OTHER_PREFIX
 from pipeline.physics.effects import catalogue
 from pipeline.physics.effects.base import largest_by_unit, unit_of
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import chdtrc, fdtrc
 
 from pipeline.estimation.gauss_markov import Setting
-from pipeline.estimation.multi_position.likelihood import project_out
+from pipeline.estimation.multi_position.fit import project_out
 from pipeline.estimation.multi_position.model import Equations, NoiseHypothesis
 
 WHITE = [NoiseHypothesis(Setting(0.0, 1.0), (0.0,))]
