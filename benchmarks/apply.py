@@ -183,7 +183,7 @@ WAYS: dict[str, Callable[[Path, Path, Path], int]] = {
     "mcap official": mcap_official,
 }
 MODULES = {
-    "csv": ["pyarrow.csv", "pyarrow.compute", "pipeline.app.field_logs.text_output", "pipeline.physics.compensation"],
+    "csv": ["pyarrow.csv", "pyarrow.compute", "pipeline.app.field_logs.stream", "pipeline.physics.compensation"],
     "mcap": [
         "zstandard",
         "mcap.writer",

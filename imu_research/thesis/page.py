@@ -30,7 +30,7 @@ from imu_research.thesis.tables import (
     read_printed,
 )
 from pipeline.core.records import SENSOR_UNITS
-from pipeline.core.records.correction import corrected, steps_of
+from pipeline.core.records.calibration import corrected, steps_of
 from pipeline.evaluation.held_out.samples import samples_of_motion
 from pipeline.output.pages.chart import AXES_LEGEND, Figure, Panel, SampleMarks, chart
 from pipeline.output.pages.group_charts import Point, curves, stems

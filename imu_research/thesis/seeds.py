@@ -31,7 +31,7 @@ import numpy as np
 
 from imu_research.thesis.tables import AXES, DEVICES, SILENT
 from pipeline.core.records import SENSORS, Mask, NotCalibrated, Recording, Values
-from pipeline.core.records.correction import corrected
+from pipeline.core.records.calibration import corrected
 from pipeline.estimation.accelerometer import staged as accelerometer
 from pipeline.estimation.gyroscope import cholesky_lu
 from pipeline.estimation.gyroscope import staged as gyroscope

@@ -17,7 +17,7 @@ The stage ``given`` (``method=given``) is no fit: it takes bias, matrix and effe
 for validation and diagnosis with the recordings. The uncertainty is that of the file. If the file states none, the
 covariance is zero, which the budget states; any held-out error beyond noise is then an error of the calibration.
 
-``pipeline.core.records.correction`` describes the correction of readings by the stages so far.
+``pipeline.core.records.calibration`` describes the correction of readings by the stages so far.
 
 Subtract effects with known parameters from readings, and keep them in the calibration that is fitted to the others.
 

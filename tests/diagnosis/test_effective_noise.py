@@ -11,7 +11,7 @@ from unit_settings import settings_of
 
 from pipeline.core.records import Estimate, Noise, Recording, SensorCalibration, SensorDiagnosis
 from pipeline.core.verdicts import Verdict
-from pipeline.evaluation.diagnosis.effective_noise import effective_noise
+from pipeline.evaluation.diagnosis.diagnose import effective_noise
 from tests.published import candidate
 
 DT, N = 0.01, 60_000

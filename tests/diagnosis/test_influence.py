@@ -13,8 +13,8 @@ from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
-from pipeline.evaluation.diagnosis.influence import influence
 from pipeline.evaluation.diagnosis.residual_dependence import goodness_of_fit
+from pipeline.evaluation.diagnosis.turntable import influence
 from pipeline.simulation.description import shipped_settings
 
 SHEET = shipped_settings(sensor="mpu6050").sensor

@@ -8,8 +8,8 @@ from unit_settings import settings_of
 
 from pipeline.core.records import Candidate, Estimate, Noise, Recording, SensorCalibration, SensorDiagnosis
 from pipeline.core.verdicts import Verdict
+from pipeline.evaluation.diagnosis.diagnose import without_impossible
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput
-from pipeline.evaluation.diagnosis.possible import without_impossible
 from pipeline.evaluation.diagnosis.verdict import MAX_SCATTER_BY_HAND, VerdictInput, decide
 
 if TYPE_CHECKING:

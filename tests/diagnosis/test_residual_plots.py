@@ -15,7 +15,7 @@ from unit_settings import settings_of
 from pipeline.core.records import Recording, SensorCalibration
 from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.noise import estimate_noise
-from pipeline.evaluation.diagnosis.residual_plots import Bins
+from pipeline.evaluation.diagnosis.residual_dependence import Bins
 from pipeline.simulation.description import shipped_settings
 from tests.published import diagnose
 

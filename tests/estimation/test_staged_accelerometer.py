@@ -9,7 +9,7 @@ from unit_settings import filter_of, with_noise
 
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.core.records import SensorCalibration, StageResult, coverage_factor
-from pipeline.core.records.correction import Subtract, TwoSided, corrected
+from pipeline.core.records.calibration import Subtract, TwoSided, corrected
 from pipeline.estimation.stages import fit_stage
 from pipeline.physics.signal.filters import apply_filter
 

@@ -9,7 +9,7 @@ from unit_settings import filter_of, with_noise
 
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.core.records import SensorCalibration, StageResult, coverage_factor
-from pipeline.core.records.correction import Subtract, corrected
+from pipeline.core.records.calibration import Subtract, corrected
 from pipeline.estimation.stages import fit_stage
 from pipeline.physics.kinematics import earth_rate
 from pipeline.physics.signal.filters import apply_filter

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.checks.coarse_temperature import refined
+from pipeline.checks.checks import refined
 from pipeline.core.records import Recording
 from pipeline.physics.signal.filters import temperature_of
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.app.config.compose import Composer
-from pipeline.app.profile_detection.sheet_proposal import proposed_sheet
+from pipeline.app.profile_detection.recording_facts import proposed_sheet
 from tests.study.listed_recordings import Unit, at_rest, joined, turned
 
 if TYPE_CHECKING:

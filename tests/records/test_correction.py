@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.records.correction import CorrectionStep, TwoSided, corrected, published, steps_of
+from pipeline.core.records.calibration import CorrectionStep, TwoSided, corrected, published, steps_of
 
 
 def read(correction: dict[str, Any]) -> tuple[CorrectionStep, ...]:

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from unit_settings import settings_of
 
 from pipeline.core.records import Noise, SensorCalibration
-from pipeline.evaluation.held_out.expected_error import LinearizedSamples, expected_rms_error
+from pipeline.evaluation.held_out.error_breakdown import LinearizedSamples, expected_rms_error
 
 UNITS, SAMPLES, INTERVAL = 2000, 300, 0.2
 WHITE, TAU = 0.01, 20.0

@@ -120,7 +120,7 @@ def _files(logs: Sequence[Path], profile: LogProfile) -> list[Path]:
     """Return the log, or all files with readings of one recording, in the order of the profile that joins them."""
     suffix = logs[0].suffix.lower()
     if suffix != ".mcap":
-        from pipeline.app.field_logs.text_output import sensor_parts  # noqa: PLC0415  (a text parser, not for MCAP)
+        from pipeline.app.field_logs.stream import sensor_parts  # noqa: PLC0415  (a text parser, not for MCAP)
 
         parts = sensor_parts(profile.ingest, messages=suffix in MESSAGE_FORMATS)
         if len(parts) > 1:

@@ -20,8 +20,7 @@ from pipeline.app.commands.readings import Reading, campaign_of, config_of_log, 
 from pipeline.app.config.campaign import find_campaign, load_campaign
 from pipeline.app.config.options import nearest
 from pipeline.app.one_unit import try_unit, unit_of_campaign
-from pipeline.app.profile_detection.recording_facts import as_text, counted, facts, topic_lines
-from pipeline.app.profile_detection.sheet_proposal import proposed_sheet
+from pipeline.app.profile_detection.recording_facts import as_text, counted, facts, proposed_sheet, topic_lines
 from pipeline.app.profile_detection.unit_guesses import propose
 from pipeline.app.run_progress import Countdown
 from pipeline.core.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, shortened

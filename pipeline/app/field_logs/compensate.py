@@ -1,6 +1,6 @@
 """Compensate a log as a stream: read, compensate and write it block by block.
 
-The modules ``pipeline.app.field_logs.text_output`` and ``mcap_log`` read and write the blocks of each format. The
+The modules ``pipeline.app.field_logs.stream`` and ``mcap_log`` read and write the blocks of each format. The
 largest block determines the memory; logs of other programs, and files that the profile joins, are read into memory.
 
 If the user states an interval with a rest (``apply --rest``), the log is read twice, first to estimate the gyroscope's
@@ -84,7 +84,7 @@ def compensate_log(
             from pipeline.app.field_logs.mcap_log import McapLog  # noqa: PLC0415  (only for this format)
 
             return McapLog(source, out, profile, stream, topic, smoothing).compensate()
-        from pipeline.app.field_logs.text_output import CsvLog, compensate_whole, sensor_parts  # noqa: PLC0415
+        from pipeline.app.field_logs.stream import CsvLog, compensate_whole, sensor_parts  # noqa: PLC0415
 
         wanted = len(sensor_parts(profile.ingest, messages=suffix in MESSAGE_FORMATS))
         if len(files) != wanted:

@@ -1,4 +1,14 @@
-"""What readers and writers of field logs share: the layout of a log, its compensation by blocks, the output."""
+"""What readers and writers of field logs share: the layout of a log, its compensation by blocks, the output.
+
+Write calibrated readings as text.
+
+In a text log, calibrated columns in g and deg/s with the canonical names ``accel_x_g`` .. ``gyro_z_dps`` replace the
+columns of the readings. All other cells, and the lines before the data, are unchanged.
+
+Logs of other programs (ROS bag, ULog, DataFlash, HDF5, MATLAB) and files that the profile joins are read with the
+checks of ingest. Their output has the columns of the canonical CSV, ``time_s, accel_x_g .. gyro_z_dps,
+temperature_degc``, in body axes.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +17,18 @@ from dataclasses import dataclass, field
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
+from pyarrow import compute as pc
+from pyarrow import csv
 
-from imu_logs.units import ACCELEROMETER, CANONICAL, GYROSCOPE, UNITS
-from pipeline.app.field_logs.log_checks import LogChecks
+from imu_logs.files import MESSAGE_FORMATS
+from imu_logs.log import in_house_unit
+from imu_logs.profile import checks_of, csv_formats, mcap_formats
+from imu_logs.text_layout import TextLayout, find_faults, other_separator
+from imu_logs.text_lines import TextLog
+from imu_logs.text_write import text_scalar, times_as_decimals, to_arrow, to_numpy
+from imu_logs.units import ACCELEROMETER, CANONICAL, COUNTS, GYROSCOPE, SECOND_NS, SINCE_1970_NS, TRIADS, UNITS
+from pipeline.app.field_logs.log_checks import DECIMALS, LogChecks
 from pipeline.core.errors import ConfigurationError, InputError, PipelineError
 from pipeline.core.records import SENSORS, Recording
 from pipeline.core.settings import Ingest
@@ -22,10 +41,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.core.records import Values
+    from imu_logs.text_lines import Head
+    from pipeline.core.records import Integers, Values
     from pipeline.physics.compensation import Compensation
 
     Readings = dict[str, NDArray[Any]]
+
 
 PARTS, K95 = 10, 2.262  # of a rest; Student's t for 95 %, two-sided, with 9 degrees of freedom
 USED = ("time", "temperature", *ACCELEROMETER, *GYROSCOPE)
@@ -198,3 +219,206 @@ def user_errors(target: Path) -> Iterator[None]:
         raise InputError("the output was closed before it was complete", str(target)) from None
     except OSError as error:
         raise InputError(f"the output cannot be written: {error.strerror}", str(target)) from None
+
+
+EXTRAPOLATED = "extrapolated"  # 1 where a row is beyond the soaked temperatures, else 0
+BLOCK_ROWS = 20_000  # of a message log, like a block of a text log
+CHANNELS_OF_SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
+
+
+class CsvLog:
+    """A text log and its compensated copy."""
+
+    def __init__(self, source: Path, out: Output, profile: LogProfile, stream: LogStream) -> None:
+        (part,) = sensor_parts(profile.ingest)
+        self.source, self.out, self.profile, self.stream = source, out, profile, stream
+        self.settings = csv_formats(profile.ingest)[part]
+        self.columns = {c.channel: c for c in self.settings.columns}
+        self.places: dict[str, list[int]] = {}  # indices of the columns of each signal
+        self.origin = 0.0
+        self.marked = False  # whether a column states which rows are beyond the soaked temperatures
+
+    def compensate(self, block_bytes: int) -> Result:
+        """Write the log with calibrated readings."""
+        with self.source.open("rb") as raw:
+            log = TextLog(raw, str(self.source), self.settings, keep_open_line=True, block_bytes=block_bytes)
+            rows = 0
+            for body, lines in log:
+                if rows == 0:
+                    self._begin(log.head)
+                try:
+                    table = self.layout.parse(body, dict.fromkeys(range(len(self.layout.names)), pa.string()))
+                    cells = [column.combine_chunks() for column in table.columns]
+                    signals = self._signals(cells, rows)
+                except pa.ArrowInvalid as error:
+                    raise self._refusal(body, lines, str(error)) from None
+                if rows == 0:
+                    readings = [cells[i] for s in SENSORS for i in self.places.get(s, [])]
+                    self.stream.checks.check_decimals(readings, self.settings.decimal)
+                calibrated = self.stream.apply(signals, raw.tell(), f"{self.source}:{lines[0]}")
+                self._replace(cells, signals, calibrated)
+                if self.marked:
+                    beyond = self.stream.checks.extrapolated(signals["temperature"])
+                    cells.append(pc.cast(to_arrow(beyond.astype(np.int64)), pa.string()))
+                self.out.write(_lines_of(cells, self.layout.delimiter, quoted=b'"' in body))
+                rows += len(lines)
+            if rows == 0:
+                self._begin(log.head)
+            self.stream.result.sensors = [sensor for sensor in SENSORS if sensor in self.places]
+            return self.stream.finish([note.detail for note in log.notes])
+
+    def _replace(self, columns: list[pa.Array], signals: Readings, readings: Readings) -> None:
+        """Replace raw by calibrated numbers in the columns; missing numbers keep their text."""
+        for sensor, values in readings.items():
+            for k, i in enumerate(self.places[sensor]):
+                text = pc.cast(to_arrow(np.round(values[:, k], DECIMALS) + 0.0), pa.string())
+                text = pc.replace_substring(text, ".", self.settings.decimal) if self.settings.decimal != "." else text
+                missing = ~np.isfinite(values[:, k])
+                if missing.any():
+                    written = pa.array(~np.isfinite(signals[sensor][:, k]))
+                    text = pc.if_else(pa.array(missing), pc.if_else(written, columns[i], ""), text)
+                columns[i] = text
+
+    def _begin(self, head: Head | None) -> None:
+        """Find the columns, and write the lines before the rows."""
+        if head is None:
+            message = "the file is empty; expected a header with the names of the columns"
+            raise InputError(message, f"{self.source}:1")
+        self._find(head.names, f"{self.source}:{head.line}")
+        places = [
+            (self.columns[c], i)
+            for s, where in self.places.items()
+            for c, i in zip(CHANNELS_OF_SIGNALS[s], where, strict=True)
+        ]
+        self.layout = TextLayout(str(self.source), head.names, places, head.delimiter, self.settings.decimal)
+        new = list(head.names)
+        for sensor in (s for s in SENSORS if s in self.places):
+            for channel, i in zip(TRIADS[sensor], self.places[sensor], strict=True):
+                new[i] = CANONICAL[channel]
+        self.marked = self.stream.checks.soaked is not None and "temperature" in self.places
+        self.out.write(head.text([*new, *[EXTRAPOLATED] * self.marked]).encode())
+
+    def _find(self, names: list[str], where: str) -> None:
+        """Find the columns of the signals by the names in the header; ``where``: its place, for messages."""
+        for signal, channels in CHANNELS_OF_SIGNALS.items():
+            expected = [self.columns[c] for c in channels if c in self.columns]
+            present = {str(c.column): index for c in expected if (index := c.index(names)) is not None}
+            twice = [name for name in present if names.count(name) > 1]
+            if twice:
+                raise InputError(f"the header names {twice[0]} more than once", where)
+            if present and len(present) < len(expected):
+                missing = ", ".join(str(c.column) for c in expected if str(c.column) not in present)
+                raise InputError(f"the header names {', '.join(present)}, but not {missing}", where)
+            if present:
+                self.places[signal] = [*present.values()]
+        if not any(sensor in self.places for sensor in SENSORS):
+            hint = "--ingest names the profile, or its file, that describes this log"
+            if {CANONICAL[c] for c in (*ACCELEROMETER, *GYROSCOPE)} & set(names):
+                hint = f"these are the columns that this command writes: the log is compensated already, else {hint}"
+            columns = ", ".join(str(self.columns[c].column) for s in SENSORS for c in TRIADS[s] if c in self.columns)
+            got = f"{', '.join(names)[:200]}{other_separator(names)}"
+            raise InputError(f"no column of a sensor; expected {columns}, got {got}; {hint}", where)
+
+    def _refusal(self, body: bytes, lines: Integers, otherwise: str) -> InputError:
+        """Return the error for the first line of a block with a cell that is not a number."""
+        for fault in find_faults(self.layout, body, lines, None):
+            if fault.kind != "not_finite":
+                return InputError(fault.message, f"{self.source}:{fault.line}")
+        return InputError(f"the log is no table of numbers: {otherwise}", f"{self.source}:{lines[0]}")
+
+    def _numbers(self, cells: pa.Array) -> Values:
+        """Return a column as numbers, NaN for an empty cell; raises ``ArrowInvalid`` if a cell is not a number."""
+        text = cells if self.settings.decimal == "." else pc.replace_substring(cells, self.settings.decimal, ".")
+        try:
+            numbers = pc.cast(text, pa.float64())
+        except pa.ArrowInvalid:  # blanks, empty cells, or other text
+            text = pc.utf8_trim_whitespace(text)
+            numbers = pc.cast(pc.if_else(pc.equal(text, ""), pa.scalar(None, pa.string()), text), pa.float64())
+        return to_numpy(pc.fill_null(numbers, np.nan) if numbers.null_count else numbers)
+
+    def _signals(self, cells: list[pa.Array], rows: int) -> dict[str, Any]:
+        """Return the signals of a block that begins at row ``rows``: g and deg/s in body axes, degC and s."""
+        signals: dict[str, Any] = {}
+        for signal, where in self.places.items():
+            numbers = np.column_stack([self._numbers(cells[i]) for i in where])
+            for k, channel in enumerate(CHANNELS_OF_SIGNALS[signal]):
+                column = self.columns[channel]
+                if channel != "time" or column.unit == COUNTS:
+                    numbers[:, k] = in_house_unit(column, numbers[:, k])
+                else:
+                    numbers[:, k] /= SECOND_NS / UNITS["time"][column.unit][0]
+            signals[signal] = self.profile.to_body(signal, numbers) if signal in SENSORS else numbers[:, 0]
+        if self.settings.rate_hz is not None:
+            signals["time"] = np.arange(rows, rows + len(cells[0])) / self.settings.rate_hz
+        if "time" in signals:
+            if rows == 0 and signals["time"][0] > SINCE_1970_NS / SECOND_NS:
+                self.origin = float(signals["time"][0])
+            signals["time"] = signals["time"] - self.origin
+        return signals
+
+
+def sensor_parts(ingest: Ingest, *, messages: bool = False) -> list[int]:
+    """Return the indices of the files with readings or the temperature in the profile's ``parts``.
+
+    ``messages``: of message logs.
+    """
+    channels = {*ACCELEROMETER, *GYROSCOPE, "temperature"}
+    if messages:
+        return list(range(len(mcap_formats(ingest))))
+    return [i for i, layout in enumerate(csv_formats(ingest)) if channels & {c.channel for c in layout.columns}]
+
+
+def compensate_whole(files: Sequence[Path], out: Output, profile: LogProfile, stream: LogStream) -> Result:
+    """Write the calibrated readings of a message log, or of files joined on equal time, as text."""
+    source, ingest = files[0], profile.ingest
+    if source.suffix.lower() in MESSAGE_FORMATS:
+        from imu_logs.message_read import read_logs  # noqa: PLC0415  (slow import, not for text logs)
+
+        table = read_logs(files, ingest)
+    else:
+        from imu_logs.text_read import read_csv  # noqa: PLC0415  (only for joined files)
+
+        layouts = csv_formats(ingest)
+        table = read_csv(files, [layouts[part] for part in sensor_parts(ingest)], checks_of(ingest))
+    origin = int(table.time_ns[0]) if table.time_ns[0] > SINCE_1970_NS else 0
+    signals = {
+        s: profile.to_body(s, np.column_stack([table.values[c] for c in triad]))
+        for s, triad in TRIADS.items()
+        if triad[0] in table.values
+    }
+    names = ["time", *(c for s in signals for c in TRIADS[s]), *(["temperature"] * ("temperature" in table.values))]
+    signals |= {"time": (table.time_ns - origin) / 1e9}
+    signals |= {"temperature": table.values["temperature"]} if "temperature" in table.values else {}
+    marked = stream.checks.soaked is not None and "temperature" in signals
+    out.write((",".join([*(CANONICAL[c] for c in names), *[EXTRAPOLATED] * marked]) + "\n").encode())
+    for start in range(0, len(table.time_ns), BLOCK_ROWS):
+        block = {name: values[start : start + BLOCK_ROWS] for name, values in signals.items()}
+        readings = stream.apply(block, 0, str(source), f" (row {start + 1})")
+        columns = [v for s in SENSORS if s in readings for v in readings[s].T]
+        columns += [block["temperature"]] if "temperature" in block else []
+        arrays = [times_as_decimals(table.time_ns[start : start + BLOCK_ROWS])]
+        arrays += [to_arrow(np.round(v, DECIMALS) + 0.0) for v in columns]
+        arrays += [to_arrow(stream.checks.extrapolated(block["temperature"]).astype(np.int64))] if marked else []
+        sink = pa.BufferOutputStream()
+        rows = pa.Table.from_arrays(arrays, [str(i) for i in range(len(arrays))])
+        csv.write_csv(rows, sink, csv.WriteOptions(include_header=False))
+        out.write(memoryview(sink.getvalue()))
+    return stream.finish([f"{n.code}: {n.detail}" for n in table.notes])
+
+
+def _lines_of(columns: list[pa.Array], delimiter: str, *, quoted: bool) -> memoryview:
+    """Return the rows as lines of text; ``quoted``: whether cells may need quotes."""
+    cells = [_quoted(column, delimiter) for column in columns] if quoted else list(columns)
+    cells[-1] = pc.binary_join_element_wise(cells[-1], text_scalar("\n"), text_scalar(""))
+    lines = pc.binary_join_element_wise(*cells, text_scalar(delimiter)) if len(cells) > 1 else cells[0]
+    ends = np.frombuffer(lines.buffers()[1], np.int32, len(lines) + 1, 4 * lines.offset)
+    return memoryview(lines.buffers()[2])[ends[0] : ends[-1]]
+
+
+def _quoted(column: pa.Array, delimiter: str) -> pa.Array:
+    """Quote the cells that contain a delimiter, a quote or a line end."""
+    special = pc.match_substring_regex(column, f'["{delimiter}\r\n]')
+    if not pc.any(special).as_py():
+        return column
+    doubled = pc.replace_substring(column, '"', '""')
+    return pc.if_else(special, pc.binary_join_element_wise('"', doubled, '"', ""), column)

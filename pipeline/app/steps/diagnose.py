@@ -10,8 +10,7 @@ from pipeline.core.errors import omission
 from pipeline.core.records import SCHEMA_VERSION, SensorDiagnosis, Validation, calibrated
 from pipeline.estimation.noise import required_noises
 from pipeline.estimation.stages import without_known_effects
-from pipeline.evaluation.diagnosis.diagnose import diagnose, without_diagnosis
-from pipeline.evaluation.diagnosis.effective_noise import effective_noise
+from pipeline.evaluation.diagnosis.diagnose import diagnose, effective_noise, without_diagnosis
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

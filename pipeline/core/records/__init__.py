@@ -3,8 +3,17 @@
 from imu_logs.log import Index, Integers, Mask, Note, Values
 from imu_logs.units import AXES, SENSOR_UNITS, SENSORS
 from pipeline.core.records.budget import (
+    AFTER_BASE,
+    BASE,
+    BASE_COUNT,
+    BASE_NAMES,
+    BIAS,
+    BIAS_NAMES,
     LIMIT,
     LINEAR,
+    MATRIX,
+    MATRIX_NAMES,
+    MATRIX_ROWS,
     MONTE_CARLO,
     NORMAL,
     RECTANGULAR,
@@ -12,23 +21,34 @@ from pipeline.core.records.budget import (
     Budget,
     BudgetLine,
     Contribution,
+    Estimate,
     MonteCarlo,
     NoMonteCarlo,
     NotIncluded,
+    Parameters,
+    base_units,
+    base_values,
+    coverage_factor,
     finite,
+    matrix_of,
+    standard_uncertainty,
 )
 from pipeline.core.records.calibration import (
     READABLE_VERSIONS,
     SCHEMA_VERSION,
+    CorrectionStep,
     Fit,
     FittedEffect,
+    Multiply,
     NotCalibrated,
     SensorCalibration,
     StageResult,
+    Subtract,
+    TwoSided,
     calibrated,
+    corrected,
     fit_from_json,
 )
-from pipeline.core.records.correction import CorrectionStep, Multiply, Subtract, TwoSided, corrected
 from pipeline.core.records.diagnosis import (
     Answer,
     Candidate,
@@ -40,24 +60,6 @@ from pipeline.core.records.diagnosis import (
     SensorDiagnosis,
     TableEvidence,
     Wander,
-)
-from pipeline.core.records.parameters import (
-    AFTER_BASE,
-    BASE,
-    BASE_COUNT,
-    BASE_NAMES,
-    BIAS,
-    BIAS_NAMES,
-    MATRIX,
-    MATRIX_NAMES,
-    MATRIX_ROWS,
-    Estimate,
-    Parameters,
-    base_units,
-    base_values,
-    coverage_factor,
-    matrix_of,
-    standard_uncertainty,
 )
 from pipeline.core.records.recording import (
     BETWEEN_ATTITUDES_S,

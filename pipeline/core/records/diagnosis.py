@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.core.records.parameters import Estimate
+    from pipeline.core.records.budget import Estimate
     from pipeline.core.verdicts import Verdict
 
 

@@ -2,12 +2,32 @@
 
 ``turntable`` or, for rests and moves by hand, ``multi_position`` selects effects and returns ``Findings``.
 ``diagnosis_of`` states them as a diagnosis, which ``verdict`` compares with the error on held-out motion.
+
+Find the selected effects that are no possible cause of the residual, with the reasons.
+
+    beyond the sensor file      |p| - 1.96 u > 3 limit, unless the settings accept it
+    by the thermometer          the temperature changes by less than its resolution
+    by the Earth                a rate of more than the Earth's, 15.04 deg/h
+    by the noise                white noise of more than 3 times what the sensor's file states: that of another sensor
+                                (``generic`` is of no sensor, and states none)
+
+Such effects fit best, and are listed as ``candidates``; the verdict is ``unexplained`` and nothing is offered.
+
+Compute the effective noise in motion: white noise whose averages scatter as much as those of the error in motion.
+
+    n_e(t)^2 = t var(mean of the error over t),    over_white = n_e / n,   n^2 = white^2 dt
+
+The error is that of the calibrated readings on held-out motion, of the vector or, without a logged attitude, of the
+magnitude. Its mean is subtracted, since an estimator takes it as bias. The variance is over consecutive stretches of
+length t and the axes. White noise alone gives n at every t. Effects that are not compensated add errors that last as
+long as the motion, so an estimator needs several times the noise at rest. The share of an effect that the diagnosis
+found is n_e of the effect's own error, by the parameters of the diagnosis.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,23 +35,25 @@ from pipeline.core.errors import ConvergenceError, NotObservableError
 from pipeline.core.records import (
     MATRIX,
     MovesError,
+    FittedEffect,
     Noise,
     Recording,
     SensorCalibration,
     SensorDiagnosis,
     SensorValidation,
+    Values,
 )
 from pipeline.core.settings import Uncertainty
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
 from pipeline.estimation.design import OTHER_PREFIX
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
+from pipeline.estimation.gates import TIMES_POSSIBLE, possible
 from pipeline.estimation.noise import with_noises
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.stages import last_fit
 from pipeline.evaluation.diagnosis import multi_position, turntable
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, diagnosis_of
-from pipeline.evaluation.diagnosis.possible import without_impossible
 from pipeline.evaluation.diagnosis.verdict import (
     EXPLAINED,
     MAX_UNKNOWN_PROBABILITY,
@@ -40,15 +62,79 @@ from pipeline.evaluation.diagnosis.verdict import (
     judged,
     may_be_unknown,
 )
+from pipeline.evaluation.diagnosis.words import plain
+from pipeline.evaluation.held_out.error_breakdown import last_step
 from pipeline.evaluation.held_out.heldout import last_error, static_error
-from pipeline.evaluation.held_out.samples import HeldOutCase
+from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, samples_of_motion
 from pipeline.physics.calibration_file import not_determined
-from pipeline.physics.effects import catalogue, effect
+from pipeline.physics.effects import catalogue, effect, effect_of
+from pipeline.physics.effects.base import parameter_limits, truth, unit_of
+from pipeline.physics.kinematics import EARTH_RATE_DPS
+from pipeline.physics.measurement import linear_truth
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.core.settings import Effects, Settings
+    from pipeline.core.records import Candidate, Recording
+    from pipeline.core.settings import Effects, Settings, Table
+
+
+EARTH = "earth_rotation"
+OTHER_FILE = "check that the sensor's file is that of this unit, and that its range and units are right"
+
+
+def without_impossible(found: SensorDiagnosis, case: DiagnosisInput) -> SensorDiagnosis:
+    """Return the diagnosis with the selected effects that are not possible as candidates, and without a selection."""
+    reasons = {entry.effect: reason for entry in found.chosen if (reason := _contradiction(entry, case))}
+    if not reasons:
+        return found
+    told = "; ".join(
+        f"{plain(name)} fits the residual best and is no cause: {reason}" for name, reason in reasons.items()
+    )
+    doubted = found.verdict == Verdict.REFERENCE_IN_DOUBT
+    return replace(
+        found,
+        verdict=found.verdict if doubted else Verdict.UNEXPLAINED,
+        selected=(),
+        candidates=reasons,
+        reason=f"{found.reason} {told[0].upper()}{told[1:]}.".strip(),
+        next_experiment=found.next_experiment if doubted else OTHER_FILE,
+        override="",
+    )
+
+
+def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
+    """Return why a selected effect is not possible; empty if it is."""
+    this, sheet = effect(entry.effect), case.data_sheet
+    values = np.array([p.value for p in entry.parameters.values()])
+    u = np.array([p.standard_uncertainty or 0.0 for p in entry.parameters.values()])
+    limits = parameter_limits(this, case.sensor, sheet.effects)
+    if len(limits) == len(values) and not sheet.accept_implausible and not possible(values, u, limits):
+        ratio = float(np.max(np.abs(values) / limits))
+        return f"it would be {ratio:.3g} times the data sheet's limit; at most {TIMES_POSSIBLE:g} times is possible"
+    if entry.effect == EARTH and np.linalg.norm(values) - 2.0 * float(np.max(u)) > EARTH_RATE_DPS:
+        return f"{np.linalg.norm(values):.2g} deg/s is more than the Earth turns ({EARTH_RATE_DPS:.2g} deg/s)"
+    if "temperature" in this.needs:
+        span, resolution = _temperatures([r for r in case.recordings if r.role != "validation"])
+        if span < resolution:
+            return f"the temperature changes by {span:.2g} degC, less than its resolution of {resolution:.2g} degC"
+    used = [r for r in case.recordings if r.reading(case.sensor) is not None]
+    density = sheet.stated("noise_density")
+    if density is not None and case.noise is not None and case.noise.step is None and used:
+        excess = float(np.min(case.noise.white)) / (density * float(np.sqrt(0.5 / used[0].interval)))
+        if excess > TIMES_POSSIBLE:
+            return f"the noise is {excess:.2g} times the sensor file's, so that the file is not that of this sensor"
+    return ""
+
+
+def _temperatures(recordings: list[Recording]) -> tuple[float, float]:
+    """Return span and resolution of the temperature, degC: of the values, and the smallest step between two."""
+    known = [r.temperature for r in recordings if r.temperature is not None]
+    values = np.unique(np.concatenate(known)) if known else np.zeros(1)
+    values = values[np.isfinite(values)]
+    steps = np.diff(values)
+    resolution = float(steps[steps > 0.0].min()) if np.any(steps > 0.0) else np.inf
+    return float(np.ptp(values)), resolution
 
 
 # an accelerometer whose mountings may be wrong
@@ -289,3 +375,108 @@ def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: st
     return SensorDiagnosis(
         Verdict.NOT_ENOUGH_DATA, configured, not_observable=dict.fromkeys(names, reason), next_experiment=needed
     )
+
+
+AVERAGING_TIMES_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position
+MIN_STRETCHES = 8  # stretches, which determine a standard deviation to a quarter
+
+
+def effective_noise(
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise,
+    table: Table,
+    found: SensorDiagnosis,
+    *,
+    other: SensorCalibration | None = None,
+) -> dict[str, Any] | None:
+    """Return the effective noise of a sensor; None without held-out motion.
+
+    ``found``: the sensor's diagnosis. ``other``: calibration of the other sensor. The result has ``unit``,
+    ``recordings``, ``motion`` (rms rate in deg/s, rms change of the specific force in g, duration in s), ``white`` (n)
+    and ``densities``: for each averaging time ``density``, ``over_white`` and the share of each effect.
+    """
+    held_out = [r for r in recordings if r.role == "validation"]
+    of_motion = ((r, samples_of_motion(calibration.sensor, r, noise, table, other=other)) for r in held_out)
+    samples = [(r, s) for r, s in of_motion if s is not None]
+    errors = [(r, (s.time, e)) for r, s in samples if (e := _error(calibration, s)) is not None]
+    if not errors:
+        return None
+    of_effects = {}
+    for name in found.selected:
+        of_effect = [(s.time, _of_effect(calibration, s, found, name)) for _, s in samples]
+        if all(error is not None for _, error in of_effect):
+            of_effects[name] = of_effect
+    interval = errors[0][0].interval
+    white = float(np.sqrt(np.mean(noise.white**2) * interval))
+    densities = []
+    for time in dict.fromkeys(max(1, round(t / interval)) * interval for t in AVERAGING_TIMES_S):  # whole samples
+        density = _density([error for _, error in errors], time)
+        if density is None:
+            continue
+        shares = [{"effect": name, "density": _density(error, time)} for name, error in of_effects.items()]
+        ratio = density / white if white > 0 else None
+        densities.append(
+            {"averaging_time_s": round(time, 9), "density": density, "over_white": ratio, "effects": shares}
+        )
+    if not densities:
+        return None
+    return {
+        "unit": f"{unit_of(calibration.sensor)}/sqrt(Hz)",
+        "recordings": [r.name for r, _ in errors],
+        "motion": _motion([r for r, _ in errors]),
+        "white": white,
+        "densities": densities,
+    }
+
+
+def _error(calibration: SensorCalibration, samples: Samples) -> Values | None:
+    """Return the error of calibrated readings, (n, 3), or of their magnitude, (n, 1); None if an effect is left out."""
+    corrected = last_step(calibration, samples)
+    if corrected is None:
+        return None
+    vector, magnitude, true = corrected
+    return (np.linalg.norm(vector, axis=1) - magnitude)[:, None] if true is None else vector - true
+
+
+def _of_effect(calibration: SensorCalibration, samples: Samples, found: SensorDiagnosis, name: str) -> Values | None:
+    """Return the error by an effect of the diagnosis: (n, 3); None if motion or parameters are unknown."""
+    entry = next((e for e in found.ranking if e.effect == name), None)
+    motion = samples.motion
+    if entry is None or motion is None or not entry.parameters:
+        return None
+    fitted = FittedEffect(name, {n: {"value": p.value, "unit": p.unit} for n, p in entry.parameters.items()})
+    this = effect_of(fitted)
+    if any(getattr(motion, need) is None for need in this.needs):
+        return None
+    if this.moves:
+        return np.asarray(truth(samples.sensor, this.moved(motion, fitted.values)) - truth(samples.sensor, motion))
+    K = np.asarray(np.linalg.inv(calibration.matrix), np.float64)
+    reading = this.reading(samples.sensor, motion, K, fitted.values)
+    return np.asarray(linear_truth(calibration, calibration.bias + reading))
+
+
+def _density(parts: Sequence[tuple[Values, Values | None]], time: float) -> float | None:
+    """Return n_e from the times and errors of recordings; None for too few stretches or samples in a stretch."""
+    squares, count = 0.0, 0
+    for times, error in parts:
+        if error is None or len(times) < 2:
+            continue
+        size = round(time / float(np.median(np.diff(times))))
+        values = error[np.isfinite(error).all(axis=1)]
+        stretches = len(values) // size if size else 0
+        if not stretches:
+            continue
+        means = (values - values.mean(axis=0))[: stretches * size].reshape(stretches, size, -1).mean(axis=1)
+        squares += float(np.sum(means**2)) / means.shape[1]
+        count += stretches
+    return float(np.sqrt(time * squares / count)) if count >= MIN_STRETCHES else None
+
+
+def _motion(recordings: Sequence[Recording]) -> dict[str, float | None]:
+    """Return the extent of held-out motion by the readings."""
+    rates = [r.gyroscope - np.nanmedian(r.gyroscope, axis=0) for r in recordings if r.gyroscope is not None]
+    forces = [r.accelerometer - np.nanmean(r.accelerometer, axis=0) for r in recordings if r.accelerometer is not None]
+    rms = [float(np.sqrt(np.nanmean(np.sum(np.concatenate(v) ** 2, axis=1)))) if v else None for v in (rates, forces)]
+    duration = float(sum(r.time[-1] - r.time[0] for r in recordings))
+    return {"rate_dps": rms[0], "force_change_g": rms[1], "duration_s": duration}

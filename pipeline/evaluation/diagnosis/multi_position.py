@@ -47,8 +47,7 @@ from pipeline.evaluation.diagnosis import functional_forms as forms
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.evaluation.diagnosis.method_errors import given_differences
 from pipeline.evaluation.diagnosis.observability import MORE_RESTS, never_shown, not_observable_by_hand
-from pipeline.evaluation.diagnosis.residual_dependence import significant
-from pipeline.evaluation.diagnosis.residual_plots import added_variable_of_rests
+from pipeline.evaluation.diagnosis.residual_dependence import added_variable_of_rests, significant
 from pipeline.evaluation.diagnosis.verdict import verdict_of_selection_by_hand
 from pipeline.evaluation.diagnosis.words import listed, plain
 from pipeline.physics.effects import catalogue, effect_from

@@ -1,7 +1,7 @@
 """Decide the verdict on one sensor, from the result of its selection and the error on held-out motion.
 
 The first rule of ``RULES`` that applies decides; if none applies, the verdict is that of the selection. A held-out
-error is compared with its 99 % interval (``pipeline.evaluation.held_out.expected_error``). Without an interval it has
+error is compared with its 99 % interval (``pipeline.evaluation.held_out.error_breakdown``). Without an interval it has
 no effect.
 """
 

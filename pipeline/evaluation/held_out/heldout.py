@@ -10,7 +10,7 @@ resolution of the encoder, uncertainty of the creep at rest; not the uncertainty
 Where no attitude is logged, |t| is the reference's magnitude, and the calibrated reading gives the direction of t.
 
 A calibration is worse than the raw readings where its error is above its expected interval
-(``pipeline.evaluation.held_out.expected_error``) and a t-test confirms it. The test compares the mean squared error of
+(``pipeline.evaluation.held_out.error_breakdown``) and a t-test confirms it. The test compares the mean squared error of
 each stretch of the recordings with that of the raw readings: B stretches, B - 1 degrees of freedom, and the probability
 ``FALSE_REFUSALS``.
 
@@ -52,13 +52,15 @@ from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.rest_means import count_of_rests
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.evaluation.held_out.error_breakdown import (
+    LinearizedSamples,
     direction_known,
     error_breakdown,
+    expected_rms_error,
     last_error_of_magnitude,
     last_step,
     left_out,
+    linearized,
 )
-from pipeline.evaluation.held_out.expected_error import LinearizedSamples, expected_rms_error, linearized
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, reference_vector, squared_norm_errors
 from pipeline.ingest.quality_flags import STUCK
 from pipeline.physics.effects import bench_priors, effect_of

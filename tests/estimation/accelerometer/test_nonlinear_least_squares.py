@@ -15,7 +15,7 @@ from unit_settings import settings_of, with_noise
 from pipeline.app.planning.guide import derivative_of
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.core.records import Recording, SensorCalibration, StageResult, coverage_factor
-from pipeline.core.records.correction import corrected
+from pipeline.core.records.calibration import corrected
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit, triangle
 from pipeline.estimation.gauss_markov import WanderPrior
 from pipeline.estimation.multi_position.accelerometer import AccelerometerModel

@@ -10,7 +10,7 @@ from unit_settings import settings_of, with_noise
 
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.core.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
-from pipeline.core.records.correction import corrected
+from pipeline.core.records.calibration import corrected
 from pipeline.estimation.gyroscope.cholesky_lu import factorise, fit
 from pipeline.estimation.stages import fit_stage
 
