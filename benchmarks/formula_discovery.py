@@ -51,8 +51,8 @@ from pipeline.physics.effects import effect_from, forget, register
 from pipeline.physics.effects.base import Layout, per_axis, truth
 from pipeline.physics.formula import parse
 from pipeline.physics.kinematics import reference_motion
+from pipeline.simulation.campaign import Streams, random_environment
 from pipeline.simulation.description import shipped_settings
-from pipeline.simulation.session import Streams, random_environment
 
 JSON = dict[str, Any]
 MODEL = "mpu6050"

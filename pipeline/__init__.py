@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from pipeline.app.result import UnitResult
+    from pipeline.app.one_unit import UnitResult
     from pipeline.output.campaign_results import CampaignResults
     from pipeline.physics.compensation import Compensation
 
@@ -94,8 +94,7 @@ def calibrate(
     PipelineError
         The error whose code, message and file a run publishes for a failed unit.
     """
-    from pipeline.app.one_unit import unit_without_campaign  # noqa: PLC0415  (Hydra is imported only where needed)
-    from pipeline.app.result import UnitResult  # noqa: PLC0415
+    from pipeline.app.one_unit import UnitResult, unit_without_campaign  # noqa: PLC0415  (Hydra is imported only here)
 
     chosen = {"sensor": sensor, "table": table, "procedure": procedure, "method": method}
     configured = unit_without_campaign(recordings, chosen, overrides, python_effects)
@@ -135,12 +134,12 @@ def calibrate_unit(
     from pipeline.app.config import load_campaign as load  # noqa: PLC0415  (Hydra is imported only where needed)
     from pipeline.app.config.layers import as_list  # noqa: PLC0415
     from pipeline.app.one_unit import (  # noqa: PLC0415
+        UnitResult,
         files_of_effects,
         notes_of_campaign,
         require_simulated,
         unit_of_campaign,
     )
-    from pipeline.app.result import UnitResult  # noqa: PLC0415
     from pipeline.output.outcome import DEFAULT_RESULTS  # noqa: PLC0415
 
     settings: Mapping[str, Any] = {

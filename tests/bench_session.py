@@ -11,9 +11,9 @@ from scipy.signal import lfilter
 from pipeline.core.records import AXES, Motion, Recording
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import truth
-from pipeline.simulation.procedures import Course, plan
+from pipeline.simulation.campaign import Environment
+from pipeline.simulation.description import Course, plan
 from pipeline.simulation.sensor import ALTERATIONS, Scene, alter
-from pipeline.simulation.session import Environment
 
 if TYPE_CHECKING:
     from pipeline.simulation.trajectory import Planned

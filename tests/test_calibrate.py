@@ -34,7 +34,7 @@ from pipeline.core.verdicts import Verdict
 from pipeline.physics.effects import catalogue
 
 if TYPE_CHECKING:
-    from pipeline.app.result import UnitResult
+    from pipeline.app.one_unit import UnitResult
     from pipeline.unit import UnitState
 
 COURSE = "--units 1 --sensor mpu6050 --quiet --step 45 --dwell 1 --rates 60 --validation 30 --seed 4"

@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.app.planning.guide import in_words
 from pipeline.physics.kinematics import LEVEL_AT_ZERO
 from pipeline.physics.signal.rests import SETTLING_S
-from pipeline.simulation.procedures import Course, plan
+from pipeline.simulation.description import Course, plan
 from pipeline.simulation.trajectory import rotation_about
 
 INK, GREY, TURN, FILL = "#1f2937", "#6b7280", "#b45309", ("#e5e7eb", "#f3f4f6", "#d1d5db")

@@ -48,9 +48,8 @@ from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.base import truth
 from pipeline.physics.kinematics import reference_motion
-from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.campaign import Streams, random_environment, simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
-from pipeline.simulation.session import Streams, random_environment
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -35,8 +35,7 @@ from pipeline.evaluation.held_out.samples import samples_of_motion
 from pipeline.output.pages.chart import AXES_LEGEND, Figure, Panel, SampleMarks, chart
 from pipeline.output.pages.group_charts import Point, curves, stems
 from pipeline.output.pages.held_out_section import held_out_over_time
-from pipeline.output.pages.numbers import MINUS, NOTHING, number
-from pipeline.output.pages.pages import template
+from pipeline.output.pages.pages import MINUS, NOTHING, number, template
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:

@@ -38,10 +38,9 @@ from pipeline.estimation.gyroscope import staged as gyroscope
 from pipeline.evaluation.held_out.samples import samples_of_motion
 from pipeline.physics.measurement import linear_truth
 from pipeline.physics.signal.filters import apply_filter
-from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.campaign import received, simulate_unit
 from pipeline.simulation.description import Description, UnitDescription, read_description, shipped_settings
 from pipeline.simulation.sensor import SimulatedSensor, bias_wander
-from pipeline.simulation.session import received
 from pipeline.unit import run_checked
 
 if TYPE_CHECKING:

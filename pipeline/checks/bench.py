@@ -54,8 +54,14 @@ import numpy as np
 
 from pipeline.core.errors import IngestError
 from pipeline.core.records import AXES
-from pipeline.ingest.axis_maps import axis_matrix
-from pipeline.ingest.gravity_rotation import FAILS_DEG, MAX_ROTATION_SAMPLES, MIN_MEDIAN_MOVES, misfits_deg, moves_of
+from pipeline.ingest.axis_maps import (
+    FAILS_DEG,
+    MAX_ROTATION_SAMPLES,
+    MIN_MEDIAN_MOVES,
+    axis_matrix,
+    misfits_deg,
+    moves_of,
+)
 from pipeline.physics.kinematics import UP_AT_ZERO
 from pipeline.physics.signal.rests import still_samples
 
@@ -64,7 +70,7 @@ if TYPE_CHECKING:
 
     from pipeline.core.records import Recording, Values
     from pipeline.core.settings import RecordingFile, Table
-    from pipeline.ingest.gravity_rotation import MoveByHand
+    from pipeline.ingest.axis_maps import MoveByHand
 
 MIN_ANGLE_SAMPLES = 10  # samples, five times the unknowns of an angle
 UP_AT_QUARTER_TURN = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg

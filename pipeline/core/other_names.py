@@ -28,7 +28,7 @@ FORMER = {  # name of version 0.1: name now; of a package, with its modules
     "pipeline.results_folder": "pipeline.app.results_folder",
     "pipeline.run_progress": "pipeline.app.run_progress",
     "pipeline.one_unit": "pipeline.app.one_unit",
-    "pipeline.result": "pipeline.app.result",
+    "pipeline.result": "pipeline.app.one_unit",
     "pipeline.campaign_results": "pipeline.output.campaign_results",
     "pipeline.history": "pipeline.output.history",
     "pipeline.outcome": "pipeline.output.outcome",

@@ -9,19 +9,23 @@ from __future__ import annotations
 
 import json
 from functools import cached_property, partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 from pyarrow import parquet
 
+import imu_logs
+from imu_logs.log import Log
 from imu_logs.text_write import to_arrow, to_numpy
 from imu_logs.units import ACCELEROMETER, ATTITUDE, CHANNELS, GYROSCOPE
 from pipeline.core.errors import InputError
 from pipeline.core.records import Note, Recording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -163,3 +167,10 @@ def _plain(value: object) -> object:
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} cannot be stored in a recording's metadata")
+
+
+def write_recording(path: Path, recording: Recording, decimals: Mapping[str, int] = MappingProxyType({})) -> None:
+    """Write a recording as a log, along the body axes: MCAP or canonical CSV by the suffix (``imu_logs.write``)."""
+    columns = columns_of(recording)
+    time_ns, flags = columns.pop("time_ns"), columns.pop("flags", None)
+    imu_logs.write(Log(str(path), time_ns, columns, {}, flags=flags), path, decimals)

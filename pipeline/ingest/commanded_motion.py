@@ -21,8 +21,7 @@ from imu_logs.log import Log
 from imu_logs.units import TRIADS
 from pipeline.core.records import Note
 from pipeline.core.settings import ProgramRest, ProgramTurn, Repeated
-from pipeline.ingest.clock_alignment import fit_clocks
-from pipeline.ingest.encoder_log import seconds_of
+from pipeline.ingest.clock_alignment import fit_clocks, seconds_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

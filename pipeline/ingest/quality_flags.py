@@ -371,7 +371,7 @@ def _check_turn_rate(table: Log) -> None:
         ratio = float(np.median(size / rate[turning]))
         seen = f"while the table turns the angular rate is {ratio:.3g} times the table's"
     else:
-        from pipeline.ingest.gravity_rotation import declared_scale  # noqa: PLC0415  (imported where there is no table)
+        from pipeline.ingest.axis_maps import declared_scale  # noqa: PLC0415  (imported where there is no table)
 
         found = declared_scale(table)
         if found is None:

@@ -4,27 +4,44 @@ Times of a unit count from power-on. If the times of two files overlap, they are
 0), and the time between the recordings is unknown; likewise if some count from 1970 and others from power-on. Times
 since 1970 are converted to times since the first sample, because a double resolves 1.7*10^9 s to 2*10^-7 s only, too
 coarse to differentiate.
+
+Read a file of attitudes: one row an attitude, or a block of rows with equal ``label``; times do not count.
+
+The rows get times of their own, so that blocks are ``BETWEEN_ATTITUDES_S`` apart. A row that is an attitude by itself
+is a mean over an unknown time. Its white noise is that of the sensor file over ``AVERAGED_S``; the scatter of the
+attitudes about the fit adds to it.
 """
 
 from __future__ import annotations
 
+import csv
 import glob
 import itertools
 import os
 from dataclasses import replace
+from itertools import pairwise
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 import imu_logs
-from imu_logs.profile import checks_of, csv_formats
+from imu_logs.profile import TIME, checks_of, csv_formats
+from imu_logs.text_read import read_csv
 from imu_logs.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError, MissingInputError
-from pipeline.core.records import Note, Recording, files_of_readings, rate_of_attitude
+from pipeline.core.records import (
+    BETWEEN_ATTITUDES_S,
+    NOISE_OF_ROWS,
+    SENSORS,
+    Note,
+    Recording,
+    files_of_readings,
+    rate_of_attitude,
+)
 from pipeline.ingest.axis_maps import STRAIGHT, axis_maps, axis_matrix, in_body_axes, map_of_orientation
+from pipeline.ingest.clock_alignment import unwrapped
 from pipeline.ingest.disturbances import leave_out_disturbances, leave_out_shaken_rests
-from pipeline.ingest.encoder_log import unwrapped
 from pipeline.ingest.files import candidate_files
 from pipeline.ingest.quality_flags import examine
 from pipeline.ingest.recordings_sheet import require_recordings
@@ -36,7 +53,7 @@ if TYPE_CHECKING:
     from imu_logs.log import Log
     from imu_logs.profile import Checks, CsvFormat
     from pipeline.core.errors import InputError
-    from pipeline.core.records import Values
+    from pipeline.core.records import Integers, Mask, Values
     from pipeline.core.settings import Ingest, Procedure, RecordingFile, Sensor
 
 
@@ -117,8 +134,7 @@ def read_table(
     table = imu_logs.read(paths, ingest, session=session, layouts=layouts)
     if not table.apart and TABLE_TIME not in table.values:
         return table
-    from pipeline.ingest.clock_alignment import align  # noqa: PLC0415  (only where it is needed)
-    from pipeline.ingest.encoder_log import own_rows  # noqa: PLC0415  (only where it is needed)
+    from pipeline.ingest.clock_alignment import align, own_rows  # noqa: PLC0415  (only where it is needed)
 
     for log in table.apart or (own_rows(table),):
         table = align(table, log)
@@ -131,7 +147,6 @@ def _table_of(
     """Read the file or files of one recording as its entry states."""
     if entry.kind != "attitudes":
         return read_table(paths, ingest, layouts, entry.session)
-    from pipeline.ingest.attitudes import read_attitudes  # noqa: PLC0415  (few units need it)
 
     return read_attitudes(paths[0], layouts or (), sensor, checks_of(ingest))
 
@@ -265,3 +280,38 @@ def _compare_clocks(recordings: list[Recording]) -> list[Recording]:
     overlap = any(start <= end for (_, end), (start, _) in itertools.pairwise(spans))
     apart = overlap or 0 < len(since_1970) < len(recordings)
     return [replace(r, clock_shared=False) for r in recordings] if apart else recordings
+
+
+LABEL = "label"
+AVERAGED_S = 1.0  # shorter than anyone averages by hand: the noise is then rather too large
+ROW_S = 1.0  # between the rows of a block
+
+
+def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, checks: Checks) -> Log:
+    """Read the channels of a file of attitudes; raises ``IngestError`` for a log that is no text."""
+    if path.suffix.lower() != ".csv" or len(layouts) != 1:
+        raise IngestError("attitudes are read from one .csv; export them as text", str(path), code="foreign")
+    columns = tuple(c for c in layouts[0].columns if c.channel != TIME)
+    table = read_csv([path], [layouts[0].model_copy(update={"columns": columns, "rate_hz": 1.0 / ROW_S})], checks)
+    assert table.lines is not None  # noqa: S101  (of text)
+    starts = _starts(path, layouts[0], table.lines)
+    number = np.cumsum(starts) - 1
+    time = np.arange(len(starts)) * ROW_S + number * BETWEEN_ATTITUDES_S
+    notes = tuple(note for note in table.notes if note.code != "N-SYNTHTIME")
+    table = replace(table, time_ns=np.rint(time * 1e9).astype(np.int64), notes=notes)
+    if not starts.all():
+        return table
+    noise = {name: sensor.of(name).noise_density * float(np.sqrt(0.5 / AVERAGED_S)) for name in SENSORS}
+    return replace(table, source={**table.source, NOISE_OF_ROWS: noise})
+
+
+def _starts(path: Path, layout: CsvFormat, lines: Integers) -> Mask:
+    """Return at which rows an attitude begins: (n,) array of bool; every row without a column of labels."""
+    with path.open(encoding="utf-8-sig", newline="") as stream:
+        delimiter = layout.delimiter if len(layout.delimiter) == 1 else ","
+        cells = list(csv.reader(stream, delimiter=delimiter))
+    names = next(([cell.strip() for cell in row] for row in cells if LABEL in [cell.strip() for cell in row]), None)
+    if names is None:
+        return np.ones(len(lines), bool)
+    labels = [cells[line - 1][names.index(LABEL)].strip() for line in lines.tolist()]
+    return np.array([True, *(one != two for one, two in pairwise(labels))])

@@ -25,8 +25,17 @@ from pipeline.core.records import SENSORS, FittedEffect, Motion, SensorCalibrati
 from pipeline.physics.calibration_file import read_calibration, sample_covariance, sensor_of
 from pipeline.physics.effects import load_python_effect, register
 from pipeline.physics.effects.base import OF_THE_ROOM
-from pipeline.physics.log_motion import FIELDS_OF_SIGNALS, ExponentialRegression, LogEnd, fields_used, log_motion
-from pipeline.physics.measurement import SensorEffects, sensor_effects, solve, without_effects
+from pipeline.physics.measurement import (
+    FIELDS_OF_SIGNALS,
+    ExponentialRegression,
+    LogEnd,
+    SensorEffects,
+    fields_used,
+    log_motion,
+    sensor_effects,
+    solve,
+    without_effects,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -86,7 +95,7 @@ def circular(steps: Mapping[str, Steps]) -> set[str]:
 class CompensationStream:
     """Compensation of one log, block by block, by the calibrations of the calibrated sensors.
 
-    ``smoothing``, s, is the memory of the temperature's smoothing (``pipeline.physics.log_motion``); 0: none.
+    ``smoothing``, s, is the memory of the temperature's smoothing (``pipeline.physics.measurement``); 0: none.
     """
 
     def __init__(self, unit: str, calibrations: dict[str, SensorCalibration], smoothing: float) -> None:
@@ -232,7 +241,7 @@ class Compensation:
         time : (n,) array or float, s since power-on, optional
             Likewise; also with it the temperature is smoothed, causally.
         smoothing : float, s
-            Memory of the temperature's smoothing (``pipeline.physics.log_motion``); 0: none.
+            Memory of the temperature's smoothing (``pipeline.physics.measurement``); 0: none.
 
         Raises
         ------

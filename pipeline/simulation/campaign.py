@@ -1,4 +1,21 @@
-"""Write a simulated campaign: units.csv, campaign.yaml, the recordings, and the true parameters.
+"""Simulate a session: all recordings of one unit's procedure, on one clock since power-on, with the table's log.
+
+Every stream of random numbers has a separate generator, ``default_rng([seed, unit, stream])``, so that a change in one
+(say, lost samples) does not change the others.
+
+The table's log is in the sensor's rows, in a file with a separate clock, or only the commanded program is known.
+
+    tau = t + d + k t
+
+where
+
+t, tau : the sensor's and the table's clock, s
+d, k   : offset and drift of the table's clock, s and 1
+
+A file has the sampling interval of the table's computer. For a table without encoders the program is written as a
+separate procedure.
+
+Write a simulated campaign: units.csv, campaign.yaml, the recordings, and the true parameters.
 
     <directory>/units.csv, campaign.yaml, simulation.yaml
     <directory>/raw/<unit>/<recording>.csv (or .mcap)
@@ -10,41 +27,344 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+import scipy
+import yaml
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.records import AXES, SENSORS
-from pipeline.ingest.write import write_recording
-from pipeline.simulation.description import course_of, shipped_settings
-from pipeline.simulation.procedures import ONE_RECORDING, plan
-from pipeline.simulation.sensor import decimals_of, drawn_effects, drawn_sensors
-from pipeline.simulation.session import (
-    ANGLE_DECIMALS,
-    QUATERNION_DECIMALS,
-    TEMPERATURE_DECIMALS,
-    SimulatedBench,
-    Streams,
-    columns_of,
-    programs_of,
-    random_environment,
-    record,
-    with_table_log,
+from pipeline.core.records import AXES, SENSORS, Recording, continuous
+from pipeline.core.settings import ProgramRest, Repeated
+from pipeline.ingest.arrow import write_recording
+from pipeline.physics.kinematics import earth_of
+from pipeline.simulation.description import (
+    BY_FILE,
+    BY_PROGRAM,
+    ONE_RECORDING,
+    course_of,
+    plan,
+    read_option,
+    shipped_settings,
 )
+from pipeline.simulation.sensor import Scene, alter, bias_wander, decimals_of, drawn_effects, drawn_sensors
+from pipeline.simulation.trajectory import CommandedTurns, Gimbals, RestsAndMoves, random_errors, rotation_by
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.core.records import Recording
-    from pipeline.core.settings import Sensor
-    from pipeline.simulation.description import Description, UnitDescription
+    from numpy.typing import NDArray
+
+    from pipeline.core.records import Values
+    from pipeline.core.settings import ProgramTurn, Sensor, Table
+    from pipeline.ingest.commanded_motion import Program
+    from pipeline.simulation.description import Course, Description, UnitDescription
     from pipeline.simulation.sensor import Hidden, SimulatedSensor
     from pipeline.simulation.trajectory import Planned
+
+
+STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
+NANOSECONDS = 1_000_000_000  # in a second
+ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3  # of CSV files: rounding far below any noise
+
+
+class Streams:
+    """The generators of random numbers for one unit, one for each stream."""
+
+    def __init__(self, seed: int, unit: int) -> None:
+        self._key = (seed, unit)
+
+    def __getitem__(self, stream: str) -> np.random.Generator:
+        return np.random.default_rng([*self._key, STREAMS.index(stream)])
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Temperature over time, in degC, s and rad; ``noise``: of the thermometer.
+
+        T(t) = ambient + warm_up (1 - exp(-t / warm_up_time)) + drift sum_k sin(2 pi t / p_k + phase_k) / 2 + ramp(t)
+
+    where p_k are the two ``periods`` of the room, half an hour to two hours, and ``ramp(t)`` is the triangle of a
+    thermal chamber: up, down below the room, and back.
+    """
+
+    ambient: float
+    warm_up: float
+    warm_up_time: float
+    drift: float
+    periods: Values
+    phases: Values
+    ramp: float = 0.0
+    ramp_period: float = 3600.0
+    noise: float = 0.03
+
+    def temperature(self, time: Values) -> Values:
+        """Return the true temperature: (n,) array, degC; time in s since power-on."""
+        room = np.sin(2.0 * np.pi * time[:, None] / self.periods + self.phases).sum(1) / 2.0
+        triangle = 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * time / self.ramp_period))
+        warm = self.warm_up * (1.0 - np.exp(-time / self.warm_up_time))
+        total: Values = self.ambient + warm + self.drift * room + self.ramp * triangle
+        return total
+
+    def reading(self, time: Values, rng: np.random.Generator) -> Values:
+        """Return the thermometer's reading: (n,) array, degC."""
+        return self.temperature(time) + self.noise * rng.standard_normal(len(time))
+
+
+def random_environment(rng: np.random.Generator) -> Environment:
+    """Return a room at about 25 degC (Sudsanguan 2019, 5.1) in which the unit warms up by a few degrees."""
+    return Environment(
+        ambient=25.0 + rng.uniform(-1.0, 1.0),
+        warm_up=rng.uniform(3.0, 6.0),
+        warm_up_time=rng.uniform(200.0, 400.0),
+        drift=0.3,  # of an air-conditioned room
+        periods=rng.uniform(1800.0, 7200.0, 2),
+        phases=rng.uniform(0.0, 2.0 * np.pi, 2),
+    )
+
+
+@dataclass(frozen=True)
+class SimulatedBench:
+    """Where a recording is made: the table, its errors, and the sensors as mounted on it."""
+
+    table: Table
+    imperfections: Mapping[str, Any]
+    sensors: Mapping[str, SimulatedSensor]
+
+
+def record(
+    planned: Sequence[Planned],
+    benches: Mapping[str, SimulatedBench],
+    effects: Mapping[str, Hidden],
+    *,
+    environment: Environment,
+    unit: UnitDescription,
+    pause: float,
+    streams: Streams,
+) -> list[Recording]:
+    """Simulate the recordings of a unit with its sampling interval and share of lost samples.
+
+    ``benches``: role to bench, ``""`` for all other roles; ``effects``: sensor to its effects, of which effects of
+    mounting, table and timing change the motion; ``pause``: s, between the recordings and before the first.
+    """
+    times = _times(planned, unit.interval_s, pause)
+    seconds = [t / NANOSECONDS for t in times]
+    rng = {name: streams[name] for name in ("table", "temperature", "link", *SENSORS)}
+    first = benches.get(planned[0].role, benches[""]).sensors
+    wander = {s: bias_wander(seconds, first[s].data_sheet.wander_time_s, rng[s]) for s in SENSORS}
+    out = []
+    for k, (recording, time) in enumerate(zip(planned, seconds, strict=True)):
+        bench = benches.get(recording.role, benches[""])
+        scene = _scene(recording, bench, time[0], rng["table"])
+        temperature = environment.temperature(time)
+        plain = scene.motion(time, temperature)
+        readings: dict[str, Any] = {}
+        for s in SENSORS:
+            sensor, altered = bench.sensors[s], alter(scene, {name: values for name, (_, values) in effects[s].items()})
+            motion = plain if altered is scene else altered.motion(time, temperature)
+            white = sensor.white(unit.interval_s) * rng[s].standard_normal((len(time), 3))
+            reading = sensor.exact(motion) + white + sensor.data_sheet.bias_wander * wander[s][k]
+            readings[s] = np.round(sensor.quantised(reading), decimals_of(sensor.data_sheet))
+        whole = Recording(
+            recording.name,
+            recording.role,
+            None if recording.axis is None else AXES[recording.axis],
+            times[k],
+            temperature=np.round(environment.reading(time, rng["temperature"]), TEMPERATURE_DECIMALS),
+            **readings,
+            **_log(recording, bench, time - time[0]),
+        )
+        out.append(whole.select(received(len(time), unit.lost, rng["link"])) if unit.lost else whole)
+    return out
+
+
+def _times(planned: Sequence[Planned], interval: float, pause: float) -> list[NDArray[np.int64]]:
+    """Return the sample times: whole intervals since power-on, ns."""
+    step = round(interval * NANOSECONDS)
+    out, now = [], pause
+    for recording in planned:
+        first = int(np.ceil(now / interval - 1e-9))
+        count = int(recording.trajectory.duration / interval + 1e-9) + 1
+        out.append((first + np.arange(count, dtype=np.int64)) * step)
+        now = float(out[-1][-1]) / NANOSECONDS + pause
+    return out
+
+
+def _scene(plan: Planned, bench: SimulatedBench, start: float, rng: np.random.Generator) -> Scene:
+    """Return the scene of a recording on its bench, without hidden effects."""
+    table, settings = bench.table, dict(bench.imperfections)
+    trajectory = plan.trajectory
+    if isinstance(trajectory, CommandedTurns) and table.motion != "none":
+        stops_and_goes = np.all(np.abs(np.diff(trajectory.program.stops)) < 180.0)
+        if plan.role == "accelerometer" and stops_and_goes:
+            settings["rate_error"] = (0.0, 0.0, 0.0)  # motors lose steps in fast turns only
+        errors = random_errors(trajectory.program, rng, settings, trajectory.axis)
+        shaft = settings.get("sense", 1) if table.azimuth_of == "turn_axis" else 0
+        trajectory = CommandedTurns(trajectory.axis, trajectory.program, errors, shaft)
+    up = rotation_by(np.append(np.asarray(settings.get("tilt_deg", (0.0, 0.0)), float), 0.0))[2]
+    earth = earth_of(table)
+    mounting = rotation_by(np.asarray(settings.get("mounting_deg", {}).get(plan.name, np.zeros(3)), float))
+    return Scene(
+        trajectory, start, plan.axis, table.gravity_g, up, np.zeros(3) if earth is None else earth, mounting=mounting
+    )
+
+
+def _log(plan: Planned, bench: SimulatedBench, time: Values) -> dict[str, Any]:
+    """Return the table's log of the commanded motion."""
+    trajectory = plan.trajectory
+    if bench.table.motion == "none":
+        return {}
+    if isinstance(trajectory, CommandedTurns):
+        angle, rate = trajectory.program.at(time)[:2]
+        sense = bench.imperfections.get("sense", 1)
+        angle, rate = sense * angle + bench.imperfections.get("zero_deg", {}).get(plan.name, 0.0), sense * rate
+        return {"table_angle": np.round(angle, ANGLE_DECIMALS), "table_rate": np.round(rate, ANGLE_DECIMALS)}
+    if isinstance(trajectory, Gimbals):
+        rate = np.linalg.norm(trajectory.pose(time).omega, axis=1)
+        attitude = np.round(trajectory.quaternion(time), QUATERNION_DECIMALS)
+        return {"table_attitude": attitude, "table_rate": np.round(rate, ANGLE_DECIMALS)}
+    assert isinstance(trajectory, RestsAndMoves)  # noqa: S101
+    return {"table_rate": np.zeros(len(time))} if plan.role == "static" else {}
+
+
+def received(count: int, lost: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Draw which samples the radio link delivers: all but a share ``lost``; always the first and the last."""
+    kept = rng.random(count) >= lost
+    kept[[0, -1]] = True
+    return kept
+
+
+MARGIN_S = 2.0  # by which a separate log begins earlier and ends later than the recording
+LARGEST_OFFSET_S, DRIFT_PPM = 100.0, 50.0  # of a random clock; the drift is the standard deviation of quartz clocks
+NO_TABLE: dict[str, Any] = {"table_angle": None, "table_rate": None, "table_attitude": None}
+INGEST = "table_log"  # configs/ingest that reads a separate log
+COMMENT = "# The table has no encoders: its program instead of its log. Written by python -m pipeline simulate.\n"
+
+
+def with_table_log(
+    unit: UnitDescription, planned: Sequence[Planned], recordings: list[Recording], rng: np.random.Generator
+) -> tuple[list[Recording], dict[str, float] | None]:
+    """Arrange recordings and the table's log as the unit's ``TableLog`` states; return the clock of a separate log.
+
+    Separate logs follow the recordings, each with the name of its recording.
+    """
+    log = unit.log
+    starts = [float(r.time[0]) for r in recordings]
+    if unit.procedure == ONE_RECORDING:
+        groups = [(_joined(recordings, planned, starts), planned, starts)]
+    else:
+        groups = [(r, [p], [s]) for r, p, s in zip(recordings, planned, starts, strict=True)]
+    whole = [recording for recording, _, _ in groups]
+    if log.kind == BY_PROGRAM:
+        return [replace(r, **NO_TABLE) if r.axis is not None else r for r in whole], None
+    if log.kind != BY_FILE:
+        return [_wrapped(r) if log.wrapped else r for r in whole], None
+    offset, ppm = rng.uniform(0.0, LARGEST_OFFSET_S), DRIFT_PPM * rng.standard_normal()
+    offset = float(offset if log.offset_s is None else log.offset_s)
+    drift = 1e-6 * float(ppm if log.drift_ppm is None else log.drift_ppm)
+    logs = []
+    for recording, plans, plan_starts in groups:
+        last = plan_starts[-1] + plans[-1].trajectory.duration
+        begin, end = (t + offset + drift * t for t in (plan_starts[0] - MARGIN_S, last + MARGIN_S))
+        tau: Values = begin + log.interval_s * np.arange(int((end - begin) / log.interval_s), dtype=float)
+        channels: dict[str, Any] = _logged(plans, plan_starts, (tau - offset) / (1.0 + drift))
+        if unit.procedure != ONE_RECORDING:  # a turn has the encoder, other motion the attitude
+            turn = isinstance(plans[0].trajectory, CommandedTurns)
+            known = ("table_angle", "table_rate") if turn else ("table_attitude",)
+            channels = {name: channels[name] for name in known}
+        time_ns = np.rint(tau * NANOSECONDS).astype(np.int64)
+        logged = Recording(f"{recording.name}_table", "table", None, time_ns, **channels)
+        logs.append(_wrapped(logged) if log.wrapped else logged)
+    return [*(replace(r, **NO_TABLE) for r in whole), *logs], {"offset_s": offset, "drift_ppm": 1e6 * drift}
+
+
+def _wrapped(recording: Recording) -> Recording:
+    angle = recording.table_angle
+    return recording if angle is None else replace(recording, table_angle=np.mod(angle, 360.0))
+
+
+def _joined(recordings: Sequence[Recording], planned: Sequence[Planned], starts: Sequence[float]) -> Recording:
+    """Join successive recordings to one, with the table's angle, rate and attitude throughout."""
+    blocks: dict[str, Any] = {
+        name: np.concatenate([getattr(r, name) for r in recordings])
+        for name in ("time_ns", "accelerometer", "gyroscope", "temperature")
+    }
+    whole = replace(recordings[0], name="recording", role="session", axis=None, **blocks, **NO_TABLE)
+    table: dict[str, Any] = _logged(planned, starts, whole.time)
+    return replace(whole, **table)
+
+
+def _logged(planned: Sequence[Planned], starts: Sequence[float], time: Values) -> dict[str, Values]:
+    """Return angle, rate and attitude of a table at increasing times of a session, in which ``planned`` start."""
+    angle, rate, level = np.zeros(len(time)), np.zeros(len(time)), np.zeros((len(time), 3, 3))
+    which = np.clip(np.searchsorted(starts, time, side="right") - 1, 0, None)
+    last = 0.0
+    for k in np.unique(which):
+        here = which == k
+        pose = planned[k].trajectory.pose(time[here] - starts[k])
+        angle[here] = last if pose.angle is None else pose.angle
+        rate[here] = np.linalg.norm(pose.omega, axis=1) if pose.rate is None else pose.rate
+        level[here] = pose.level
+        last = float(angle[here][-1])
+    attitude = continuous(np.roll(scipy.spatial.transform.Rotation.from_matrix(level).as_quat(), 1, axis=1))
+    return {"table_angle": angle, "table_rate": rate, "table_attitude": attitude}
+
+
+def as_program(program: Program) -> list[ProgramRest | ProgramTurn | Repeated]:
+    """Return a table's program as the steps of a procedure's ``program``; a repeated pair of steps has a count."""
+    rounded = [step.replaced(**{k: round(v, 9) for k, v in step.json_value.items()}) for step in program.steps]
+    steps = [step for step in rounded if not (isinstance(step, ProgramRest) and step.rest_s == 0.0)]
+    out: list[ProgramRest | ProgramTurn | Repeated] = []
+    i = 0
+    while i < len(steps):
+        pair, count = steps[i : i + 2], 1
+        while len(pair) == 2 and steps[i + 2 * count : i + 2 * count + 2] == pair:
+            count += 1
+        if count > 2:
+            out.append(Repeated(repeat=count, steps=pair))
+            i += 2 * count
+        else:
+            out.append(steps[i])
+            i += 1
+    return out
+
+
+def columns_of(unit: UnitDescription) -> dict[str, str]:
+    """Return the columns of ``units.csv`` that the unit's table log requires."""
+    return {BY_FILE: {"ingest": INGEST}, BY_PROGRAM: {"procedure": f"{unit.procedure}_commanded"}}.get(
+        unit.log.kind, {}
+    )
+
+
+def programs_of(units: Sequence[UnitDescription]) -> dict[str, str]:
+    """Return the procedures of tables without a log, each with its program: name to YAML.
+
+    Raises ``ConfigurationError`` if units of one procedure have different programs.
+    """
+    found: dict[str, str] = {}
+    for unit in units:
+        if unit.log.kind == BY_PROGRAM:
+            text = _procedure_text(unit.procedure, course_of(unit))
+            if found.setdefault(columns_of(unit)["procedure"], text) != text:
+                raise ConfigurationError(
+                    f"unit {unit.unit}: its table follows another program than those of the units before; simulate it "
+                    "as a separate campaign"
+                )
+    return found
+
+
+def _procedure_text(name: str, course: Course) -> str:
+    procedure = read_option("procedure", name)
+    entries = {recording: dict(entry) for recording, entry in procedure["recordings"].items()}
+    for planned in plan(name, course, np.random.default_rng(0)):
+        if isinstance(planned.trajectory, CommandedTurns) and planned.name in entries:
+            entries[planned.name]["program"] = [s.json_value for s in as_program(planned.trajectory.program)]
+    return COMMENT + yaml.safe_dump({**procedure, "recordings": entries}, sort_keys=False, width=120)
+
 
 UNITS_CSV_COLUMNS = (
     "unit",

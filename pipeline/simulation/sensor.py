@@ -37,7 +37,7 @@ mounting angles are within 1 deg (Sudsanguan 2019, chapter 3). A description may
     effects:
       gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: [0.03, 0.03, 0.03]}
 
-The keys are the keys of an effect's file (``pipeline.physics.effects.declaration``), of which only ``terms`` is
+The keys are the keys of an effect's file (``pipeline.physics.effects.formula_effect``), of which only ``terms`` is
 required, and ``values``: the parameters' values, or one size; not needed where there are ``limits``. The effect is not
 in the catalogue of a diagnosis.
 """

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.__main__ import main
 from pipeline.app.profile_detection.recording_facts import facts
 from pipeline.core.records import Recording
-from pipeline.ingest.write import write_recording
+from pipeline.ingest.arrow import write_recording
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import description_from
 

@@ -18,7 +18,7 @@ from pipeline.app.field_logs.ros2_node import MessageCalibrator
 from pipeline.core.files import write_json
 from pipeline.core.records import FittedEffect, Recording, SensorCalibration
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.ingest.write import write_recording
+from pipeline.ingest.arrow import write_recording
 
 if TYPE_CHECKING:
     from pathlib import Path

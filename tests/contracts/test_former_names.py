@@ -18,7 +18,7 @@ DOCUMENTED = {
     "pipeline.model.effects.base": "pipeline.physics.effects.base",
 }
 SAME = (
-    "pipeline.simulation.trajectory", "pipeline.simulation.procedures", "pipeline.estimation.uncertainty_budget",
+    "pipeline.simulation.trajectory", "pipeline.simulation.description", "pipeline.estimation.uncertainty_budget",
     "pipeline.estimation.monte_carlo",
 )  # fmt: skip
 

@@ -22,7 +22,7 @@ from pipeline.estimation import known_temperature
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.app.result import UnitResult
+    from pipeline.app.one_unit import UnitResult
 
 SENSORS = ("accelerometer", "gyroscope")
 TRUTH = {

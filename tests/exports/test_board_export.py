@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from test_formats import document, settings
 
 from pipeline.output.exports import exports
-from pipeline.output.exports.conversion import explain_board
+from pipeline.output.exports.reading import explain_board
 
 if TYPE_CHECKING:
     from pipeline.core.settings import Settings

@@ -17,8 +17,7 @@ from pipeline.core.records import SENSORS, Recording, SensorCalibration
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_terms import allan_variance
 from pipeline.output.exports import ExportedUnit, export
-from pipeline.output.exports.conversion import document_of, with_noise
-from pipeline.output.exports.reading import read_any
+from pipeline.output.exports.reading import document_of, read_any, with_noise
 from pipeline.output.exports.sensors import INSTABILITY_FLOOR, SensorFigures, noise
 
 if TYPE_CHECKING:

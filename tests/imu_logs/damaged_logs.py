@@ -17,7 +17,7 @@ from imu_logs import message_read as mcap
 from imu_logs.mcap_file import McapReader
 from imu_logs.profile import McapFormat
 from pipeline.core.errors import IngestError
-from pipeline.ingest.write import write_recording
+from pipeline.ingest.arrow import write_recording
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -18,8 +18,8 @@ from imu_logs.profile import csv_formats
 from imu_logs.text_read import read_csv
 from pipeline.core.errors import IngestError
 from pipeline.core.records import Recording
+from pipeline.ingest.arrow import write_recording
 from pipeline.ingest.read import read_recordings
-from pipeline.ingest.write import write_recording
 
 if TYPE_CHECKING:
     from pathlib import Path

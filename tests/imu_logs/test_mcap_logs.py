@@ -19,8 +19,8 @@ from unit_settings import ingest_of
 from imu_logs.mcap_file import McapReader
 from imu_logs.mcap_write import DEFINITIONS, IMU, JOINT_STATE, TEMPERATURE
 from pipeline.core.errors import InputError
+from pipeline.ingest.arrow import write_recording
 from pipeline.ingest.read import read_recordings
-from pipeline.ingest.write import write_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable

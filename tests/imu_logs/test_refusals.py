@@ -14,9 +14,9 @@ from unit_settings import ingest_of
 from imu_logs.files import SUFFIXES
 from pipeline.app.config.compose import check_ingest
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.ingest.arrow import write_recording
 from pipeline.ingest.files import recording_files
 from pipeline.ingest.read import read_recordings
-from pipeline.ingest.write import write_recording
 
 if TYPE_CHECKING:
     from pathlib import Path

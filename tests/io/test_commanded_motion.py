@@ -12,8 +12,8 @@ from simulated_logs import as_table
 from pipeline.core.errors import IngestError
 from pipeline.core.records import Recording
 from pipeline.ingest.commanded_motion import Program, follow_program
-from pipeline.simulation.procedures import Course, plan
-from pipeline.simulation.session import Streams, as_program
+from pipeline.simulation.campaign import Streams, as_program
+from pipeline.simulation.description import Course, plan
 from pipeline.simulation.trajectory import CommandedTurns, rest, turn
 
 BIAS, SCALE = np.array([1.3, -0.4, 0.2]), 1.01

@@ -14,8 +14,7 @@ from pipeline.core.records import SENSORS, FittedEffect, Motion, SensorCalibrati
 from pipeline.physics.compensation import BLOCK, Compensation, load
 from pipeline.physics.effects import catalogue, effect_from
 from pipeline.physics.effects.base import Owner
-from pipeline.physics.log_motion import ExponentialRegression
-from pipeline.physics.measurement import compensate, predicted_reading
+from pipeline.physics.measurement import ExponentialRegression, compensate, predicted_reading
 
 SIZE = {"accelerometer": 2e-3, "gyroscope": 1e-5}
 EFFECTS = [(s, e.name) for s in SENSORS for e in catalogue().values() if e.owner == Owner.SENSOR and s in e.sensors]

@@ -8,9 +8,19 @@ from base64 import b64decode
 import numpy as np
 import pytest
 
-from pipeline.output.pages.axis import Axis, log_ticks, round_ticks, tick_label
-from pipeline.output.pages.chart import Area, Dots, Figure, Panel, SampleMarks, chart
-from pipeline.output.pages.numbers import measured, number, span, typeset
+from pipeline.output.pages.chart import (
+    Area,
+    Axis,
+    Dots,
+    Figure,
+    Panel,
+    SampleMarks,
+    chart,
+    log_ticks,
+    round_ticks,
+    tick_label,
+)
+from pipeline.output.pages.pages import measured, number, span, typeset
 
 FIGURE = Figure("n", "t")
 

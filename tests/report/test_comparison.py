@@ -20,7 +20,7 @@ from pipeline.output.pages.comparison import (
     section,
     unit_figures,
 )
-from pipeline.output.pages.numbers import number
+from pipeline.output.pages.pages import number
 from pipeline.output.pages.parameters import Parameter
 
 from .conftest import build_unit

@@ -12,11 +12,10 @@ from unit_settings import sheet_of
 
 from pipeline.core.records import Recording
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.output.pages.axis import scaled
+from pipeline.output.pages.chart import scaled
 from pipeline.output.pages.diagnosis_section import _column_unit, added_variable, ranking, unexplained
-from pipeline.output.pages.held_out_section import error_steps
-from pipeline.output.pages.noise_section import allan, remarks, term_rows
-from pipeline.output.pages.numbers import Scale, number
+from pipeline.output.pages.held_out_section import allan, error_steps, remarks, term_rows
+from pipeline.output.pages.pages import Scale, number
 from pipeline.output.pages.residual_section import harmonic_noise, harmonics, residual_figures, residuals
 from pipeline.output.pages.unit_page import render
 

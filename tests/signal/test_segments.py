@@ -14,13 +14,11 @@ from imu_logs.profile import Checks
 from pipeline.core.errors import InputError
 from pipeline.core.records import rate_of_attitude
 from pipeline.core.settings import RecordingFile, Window
-from pipeline.ingest.encoder_log import unwrapped
+from pipeline.ingest.clock_alignment import unwrapped
 from pipeline.ingest.read import to_recording
 from pipeline.physics.signal.segments import cut
-from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import UnitDescription, course_of
-from pipeline.simulation.procedures import TRANSIT, plan
-from pipeline.simulation.session import Streams
+from pipeline.simulation.campaign import Streams, simulate_unit
+from pipeline.simulation.description import TRANSIT, UnitDescription, course_of, plan
 
 if TYPE_CHECKING:
     from pipeline.core.records import Recording

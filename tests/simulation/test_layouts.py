@@ -12,10 +12,8 @@ import yaml
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import rate_of_attitude
 from pipeline.ingest.commanded_motion import Program, _flat
-from pipeline.simulation.campaign import simulate_unit, write_campaign
-from pipeline.simulation.description import UnitDescription, description_from
-from pipeline.simulation.procedures import Course, plan
-from pipeline.simulation.session import Streams, as_program
+from pipeline.simulation.campaign import Streams, as_program, simulate_unit, write_campaign
+from pipeline.simulation.description import Course, UnitDescription, description_from, plan
 from pipeline.simulation.trajectory import CommandedTurns
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.ingest.commanded_motion import Program
 from pipeline.physics.kinematics import UP_AT_ZERO, attitude_matrix, turn_about_axis
-from pipeline.simulation.procedures import Course, plan
+from pipeline.simulation.description import Course, plan
 from pipeline.simulation.trajectory import (
     CommandedTurns,
     RestsAndMoves,

@@ -2,7 +2,7 @@
 
     python -m pytest -m study tests/study/test_ferraris_study.py -s        (200 fits of both sensors, some ten minutes)
 
-Every unit is drawn anew with the errors of a hand (``pipeline.simulation.procedures``): each face tilted by 1 deg about
+Every unit is drawn anew with the errors of a hand (``simulation.description``): each face tilted by 1 deg about
 each level axis, each turn off by 3 deg, about an axis that is 1.5 deg off. Nothing is hidden. The hand's errors of the
 session are shared by many parameters of one unit, so that the coverage of a row of the matrix scatters by more than
 that of independent parameters.

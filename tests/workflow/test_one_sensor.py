@@ -17,7 +17,7 @@ from pipeline.app.commands import apply, simulate
 from pipeline.app.config import load_campaign
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import Recording
-from pipeline.ingest.write import write_recording
+from pipeline.ingest.arrow import write_recording
 
 from .conftest import Bench
 

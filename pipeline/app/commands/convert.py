@@ -14,8 +14,7 @@ from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
 from pipeline.core.records import SENSORS
 from pipeline.output.exports import formats
-from pipeline.output.exports.conversion import convert
-from pipeline.output.exports.reading import CALIBRATION, ImportedCalibration, counts_of, format_of, read_any
+from pipeline.output.exports.reading import CALIBRATION, ImportedCalibration, convert, counts_of, format_of, read_any
 from pipeline.output.exports.sensors import SensorFigures
 
 if TYPE_CHECKING:

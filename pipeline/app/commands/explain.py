@@ -18,8 +18,7 @@ from pipeline.core.pack import batches_of, is_published, read_published
 from pipeline.core.records import SENSORS
 from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, error_of, problems
 from pipeline.evaluation.diagnosis.words import in_words
-from pipeline.output.exports.conversion import explain_board, explain_calibration
-from pipeline.output.exports.reading import counts_of, read_any
+from pipeline.output.exports.reading import counts_of, explain_board, explain_calibration, read_any
 from pipeline.output.history import read_history
 from pipeline.output.outcome import (
     NOT_CONVERGED,

@@ -14,8 +14,8 @@ from pipeline.core.records import AXES, SENSORS
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.output.exports import ExportedUnit, export, formats
 from pipeline.output.exports.sensors import SensorFigures
-from pipeline.output.pages.noise_section import remarks, term_rows
-from pipeline.output.pages.numbers import MINUS, aligned, number
+from pipeline.output.pages.held_out_section import remarks, term_rows
+from pipeline.output.pages.pages import MINUS, aligned, number
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -5,7 +5,7 @@ profile maps from the fields of other messages (protobuf, JSON, user types) give
 calibration states the noise of a sample, it gives the covariances of the calibrated sensors.
 
 As in a running system, a message is compensated with the temperatures before it in the file
-(``pipeline.physics.log_motion``). Messages before the first temperature are compensated with the first temperature.
+(``pipeline.physics.measurement``). Messages before the first temperature are compensated with the first temperature.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from imu_logs.message_decoder import MAPPED, Topics, listed_topics, topic_of
 from imu_logs.profile import mcap_format
 from imu_logs.units import ACCELEROMETER, GYROSCOPE, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.core.errors import IngestError, InputError
-from pipeline.physics.log_motion import ExponentialRegression
+from pipeline.physics.measurement import ExponentialRegression
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -25,7 +25,7 @@ from pipeline.core.records import SENSORS
 from pipeline.ingest.axis_maps import axis_matrix, maps_of_log
 from pipeline.physics.calibration_file import read_calibration
 from pipeline.physics.compensation import SMOOTHING_S, load
-from pipeline.physics.log_motion import ExponentialRegression
+from pipeline.physics.measurement import ExponentialRegression
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

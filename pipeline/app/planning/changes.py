@@ -22,8 +22,7 @@ from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import Owner
 from pipeline.physics.kinematics import LEVEL_AT_ZERO
 from pipeline.physics.signal.rests import SETTLING_S
-from pipeline.simulation.description import UnitDescription, course_of, shipped_settings
-from pipeline.simulation.procedures import TABLE_PROCEDURES, Course, plan
+from pipeline.simulation.description import TABLE_PROCEDURES, Course, UnitDescription, course_of, plan, shipped_settings
 from pipeline.simulation.trajectory import Gimbals, Planned, random_gimbals
 
 if TYPE_CHECKING:

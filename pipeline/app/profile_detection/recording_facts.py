@@ -38,7 +38,7 @@ from pipeline.checks.bench import other_axes
 from pipeline.core.errors import IngestError
 from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Recording, median
 from pipeline.core.settings import RecordingFile
-from pipeline.ingest.gravity_rotation import FAILS_DEG, FITS_DEG, misfit_deg, moves_of, rests_of
+from pipeline.ingest.axis_maps import FAILS_DEG, FITS_DEG, misfit_deg, moves_of, rests_of
 from pipeline.ingest.quality_flags import CLIPPED, GAP, REST_LIMITS, STUCK, equal_share
 from pipeline.ingest.read import read_table, to_recording
 from pipeline.physics.signal.rests import SHORTEST_REST_S, find_rests, rests_from_table, runs
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from imu_logs.log import Values
     from pipeline.core.records import Note
     from pipeline.core.settings import Sensor, Settings
-    from pipeline.ingest.gravity_rotation import MoveByHand
+    from pipeline.ingest.axis_maps import MoveByHand
     from pipeline.physics.signal.rests import Rest
 
 

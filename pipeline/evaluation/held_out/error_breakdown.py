@@ -1,4 +1,4 @@
-"""Held-out errors after each step of a calibration, and the interval in which the last lies with 99 % probability, if model, noise and uncertainties are right.
+"""Held-out errors after each step of a calibration, and the interval in which the last lies with 99 % probability.
 
 The error of the calibrated reading of held-out sample n is ``M w_n + M m_n + J_n d``, with
 
@@ -69,8 +69,7 @@ from pipeline.evaluation.held_out.samples import OTHER_SENSOR, Samples, mean_squ
 from pipeline.physics.effects import effect_of
 from pipeline.physics.effects.base import truth
 from pipeline.physics.effects.mounting import SEPARATOR, Mounting
-from pipeline.physics.log_motion import LogEnd, fields_used, log_motion
-from pipeline.physics.measurement import SensorEffects, inverse_of, linear_truth, solve
+from pipeline.physics.measurement import LogEnd, SensorEffects, fields_used, inverse_of, linear_truth, log_motion, solve
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

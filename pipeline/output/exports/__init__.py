@@ -50,8 +50,7 @@ from pipeline.physics.compensation import OF_THE_PAST, SMOOTHING_S, Steps, circu
 from pipeline.physics.effects import effect_of
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.physics.formula import c_number
-from pipeline.physics.log_motion import FIELDS_OF_SIGNALS
-from pipeline.physics.measurement import sensor_effects
+from pipeline.physics.measurement import FIELDS_OF_SIGNALS, sensor_effects
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

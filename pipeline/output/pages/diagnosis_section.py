@@ -18,7 +18,7 @@ from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW, min_
 from pipeline.estimation.posterior import prior_limit
 from pipeline.output.pages.chart import ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
 from pipeline.output.pages.group_charts import Point, bars
-from pipeline.output.pages.numbers import measured, number, percent, plain, unit_text
+from pipeline.output.pages.pages import measured, number, percent, plain, unit_text
 from pipeline.physics.effects import catalogue
 from pipeline.physics.effects.base import largest_by_unit, parameter_limits
 

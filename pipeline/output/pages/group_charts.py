@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.output.pages.axis import LINEAR_TO, Axis
 from pipeline.output.pages.chart import (
     CHART_WIDTH,
     LETTER,
+    LINEAR_TO,
+    Axis,
     ChartLayer,
     Dots,
     Figure,
@@ -26,7 +27,7 @@ from pipeline.output.pages.chart import (
     chart,
     text,
 )
-from pipeline.output.pages.numbers import number
+from pipeline.output.pages.pages import number
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

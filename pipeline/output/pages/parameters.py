@@ -34,9 +34,14 @@ from pipeline.core.records import (
 from pipeline.core.verdicts import Verdict, error_of
 from pipeline.estimation.candidates import is_fixed
 from pipeline.output.pages.held_out_section import first_and_last_step, passes
-from pipeline.output.pages.numbers import plain
-from pipeline.physics.calibration_file import beyond_uncertainty, left_out, limited_effects, without_rotation
-from pipeline.physics.open_effects import both_figures
+from pipeline.output.pages.pages import plain
+from pipeline.physics.calibration_file import (
+    beyond_uncertainty,
+    both_figures,
+    left_out,
+    limited_effects,
+    without_rotation,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable

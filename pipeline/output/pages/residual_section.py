@@ -44,7 +44,7 @@ from pipeline.output.pages.chart import (
     sentences,
 )
 from pipeline.output.pages.group_charts import stems
-from pipeline.output.pages.numbers import number
+from pipeline.output.pages.pages import number
 from pipeline.physics.kinematics import table_motion
 from pipeline.physics.measurement import predicted_reading
 from pipeline.physics.signal.encoder_rate import rate_by_angle

@@ -12,8 +12,7 @@ from pipeline.output.history import difference, dropped, errors_of, of_units
 from pipeline.output.outcome import add_command, uncertainty_words
 from pipeline.output.pages.chart import Figure
 from pipeline.output.pages.group_charts import Point, bars
-from pipeline.output.pages.numbers import number, plain
-from pipeline.output.pages.pages import template
+from pipeline.output.pages.pages import number, plain, template
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

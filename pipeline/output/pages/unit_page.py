@@ -23,16 +23,17 @@ from pipeline.output.pages.diagnosis_section import (
     upper_limits,
 )
 from pipeline.output.pages.held_out_section import (
+    allan,
     attitude_over_time,
     checks,
     error_steps,
     held_out_figures,
     passes,
+    remarks,
     step_label,
+    term_rows,
 )
-from pipeline.output.pages.noise_section import allan, remarks, term_rows
-from pipeline.output.pages.numbers import NOTHING, measured_row, number, scale_of
-from pipeline.output.pages.pages import template
+from pipeline.output.pages.pages import NOTHING, measured_row, number, scale_of, template
 from pipeline.output.pages.parameters import fitted_parameters, parameter_rows, summary_row
 from pipeline.output.pages.residual_section import measurement_and_model, residual_figures, residuals
 from pipeline.physics.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences

@@ -25,8 +25,7 @@ from imu_logs.yaml_file import load_yaml
 from pipeline.core.errors import ConfigurationError, MissingInputError, PipelineError
 from pipeline.core.files import CONFIGS
 from pipeline.physics.effects.base import Effect
-from pipeline.physics.effects.declaration import read_declaration
-from pipeline.physics.effects.formula_effect import FormulaEffect
+from pipeline.physics.effects.formula_effect import FormulaEffect, read_declaration
 from pipeline.physics.effects.mounting import SETUP_EFFECTS, in_session
 
 if TYPE_CHECKING:

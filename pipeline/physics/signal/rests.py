@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     Spans = list[tuple[int, int]]
 
 RATE_AT_REST_DPS = 0.02  # above the rate noise of a resting table
-SETTLING_S = 0.3  # fifteen time constants of the slowest filter of 20 ms, as in ``pipeline.physics.encoder_trajectory``
+SETTLING_S = 0.3  # fifteen time constants of the slowest filter of 20 ms, as in ``pipeline.physics.kinematics``
 
 WINDOW_S = 0.5  # shorter than a rest, longer than a tremor's period (8 to 12 Hz)
 GAP_S = 1.0  # longer than any regular interval of a log
