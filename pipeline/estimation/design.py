@@ -42,9 +42,8 @@ from numpy.polynomial.legendre import legvander
 
 from pipeline.core.errors import InputError, NotObservableError
 from pipeline.core.records import BASE_COUNT, MATRIX_ROWS, motion_at_rest
-from pipeline.estimation.engine import LinearMap, scaled_inverse
+from pipeline.estimation.engine import LinearMap, ScaledColumns, scaled_inverse
 from pipeline.estimation.gauss_markov import Products, Setting
-from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.observations import without_rows
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.physics.effects.base import (

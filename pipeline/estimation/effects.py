@@ -4,20 +4,33 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.core.errors import NotObservableError
+import numpy as np
+
+from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.core.records import SensorCalibration
-from pipeline.estimation.candidates import AUTO, MOUNTING, configured_effects, offered
+from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.candidates import AUTO, MOUNTING, configured_effects, limits_of, offered
 from pipeline.estimation.generalized_least_squares import fit_joint
+from pipeline.estimation.multi_position import accelerometer, gyroscope
+from pipeline.estimation.multi_position.fit import plausible, require_observable
+from pipeline.estimation.multi_position.model import selection_hypotheses
+from pipeline.estimation.multi_position.result import calibration_of
+from pipeline.estimation.multi_position.selection import SelectionByHand, fit_configured, refusal
+from pipeline.estimation.noise import with_noises
 from pipeline.estimation.observations import observe
-from pipeline.estimation.rest_means import is_multi_position
+from pipeline.estimation.rest_means import ROLE, is_multi_position
 from pipeline.estimation.selection import select
-from pipeline.estimation.stages import FitStage
+from pipeline.estimation.stages import FitStage, given_calibration, is_given
 from pipeline.physics.effects import bench_priors, effect, stated_priors
 
 if TYPE_CHECKING:
-    from pipeline.core.records import UnitRecordings
+    from collections.abc import Sequence
+
+    from pipeline.core.records import Noise, Recording, UnitRecordings
     from pipeline.core.settings import Settings
+    from pipeline.estimation.multi_position.model import Model
     from pipeline.estimation.stages import Change
+
 
 ALL: tuple[Change, ...] = ("bias", "matrix", "effects")
 FIT_STAGES = {"effects": FitStage(changes=ALL, accepts=("readings", *ALL), free=True, reference=True)}
@@ -37,8 +50,6 @@ def fit(
         return before
     noise = recordings.noises[sensor]
     if by_hand:
-        from pipeline.estimation.multi_position.effects import fit_effects_by_rests  # noqa: PLC0415  (recordings by hand alone)
-
         return fit_effects_by_rests(before, recordings, settings)
     names = configured_effects(sensor, settings, recordings.filtered)
     accelerometer = mountings_by_gravity(recordings, settings) if sensor == "gyroscope" and MOUNTING in names else None
@@ -79,3 +90,92 @@ def mountings_by_gravity(recordings: UnitRecordings, settings: Settings) -> Sens
 def of_the_angle(name: str) -> bool:
     """Return whether an effect is an error of the table's angle or axes."""
     return effect(name).owner == "table" and name not in bench_priors()
+
+
+def accelerometer_of(recordings: UnitRecordings, settings: Settings) -> SensorCalibration | None:
+    """Return the given calibration of the accelerometer (``method.given``), else calibrate it.
+
+    Raises ``CannotCalibrateError`` if that fails. None for a sheet of recordings without its readings.
+    """
+    known = any(r.role == ROLE and r.accelerometer is not None for r in recordings.filtered)
+    if settings.procedure.sheet and not known and not is_given("accelerometer", settings.method):
+        return None
+    try:
+        if is_given("accelerometer", settings.method):
+            return given_calibration("accelerometer", settings.method)
+        return nonlinear_least_squares.fit(recordings, None, settings)
+    except (NotObservableError, CannotCalibrateError) as lack:
+        raise CannotCalibrateError(
+            f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"
+        ) from lack
+
+
+def frame_error(accelerometer: SensorCalibration | None, settings: Settings) -> float:
+    """Return the standard uncertainty of each angle between the accelerometer's frame and the case, deg.
+
+    Of a sheet: its own axes are the frame, and off the case within the limit of the cross-axis sensitivity.
+    """
+    if accelerometer is None or settings.procedure.sheet is None or is_given("accelerometer", settings.method):
+        return 0.0
+    return float(np.degrees(settings.sensor.accelerometer.cross_axis / np.sqrt(3.0)))
+
+
+def model_of(
+    recordings: Sequence[Recording],
+    calibration: SensorCalibration,
+    noise: Noise | None,
+    settings: Settings,
+    other: SensorCalibration | None = None,
+) -> Model | None:
+    """Return the model of the sensor of a calibration, or None if its recordings have no rest.
+
+    ``calibration``: of the sensor's method. ``other``: of the accelerometer, where the sensor is the gyroscope; by
+    default ``accelerometer_of``.
+    """
+    if calibration.sensor == "accelerometer":
+        return accelerometer.model_of(recordings, calibration, noise, settings)
+    if other is None:
+        other = accelerometer_of(with_noises(recordings, settings.sensor, ("accelerometer",)), settings)
+    frame_deg = frame_error(other, settings)
+    return gyroscope.model_of(recordings, calibration, noise, settings.procedure, other, frame_deg=frame_deg)
+
+
+def fit_effects_by_rests(
+    before: SensorCalibration, recordings: UnitRecordings, settings: Settings
+) -> SensorCalibration:
+    """Fit the effects of ``settings.effects`` together with bias and matrix to rests and moves.
+
+    ``before``: of the sensor's method; returned unchanged where there is no effect to add. Raises
+    ``NotObservableError`` if rests and moves do not determine an effect; ``ConfigurationError`` if an effect is unknown
+    or not of this sensor.
+    """
+    sensor = before.sensor
+    wanted, data_sheet = settings.effects.of(sensor), settings.sensor.of(sensor)
+    noise, other = recordings.noises[sensor], None
+    if sensor == "gyroscope":
+        other = accelerometer_of(recordings, settings)
+    model = model_of(recordings.filtered, before, noise, settings, other)
+    if model is None:
+        return before
+    names = [] if wanted == AUTO else list(wanted)
+    if wanted == AUTO:
+        chosen = SelectionByHand(model, before, [], noise, data_sheet)
+        names = offered(chosen.names, chosen.fit.state.terms, chosen.fit.covariance, data_sheet, sensor)
+    if not names:
+        return before
+    for name in names:
+        reason = refusal(effect(name), sensor, model.rests) if sensor in effect(name).sensors else ""
+        if reason:
+            raise NotObservableError(f"{name} cannot be fitted by hand: {reason}; take it out of effects.{sensor}")
+    hypotheses = selection_hypotheses(noise, model.kinds)
+    limits = limits_of(sensor, data_sheet)
+    fitted = fit_configured(model, before, names, hypotheses)
+    if plausible(model, fitted, limits):
+        fitted = fit_configured(model, before, names, hypotheses, limits)
+    if len(fitted.residual) <= fitted.rank:
+        raise NotObservableError(
+            f"{len(model.rests.time)} rests of the {sensor} are too few for {', '.join(names)} in addition to bias and "
+            f"matrix: record at least {fitted.rank + 10} rests in as many orientations"
+        )
+    require_observable(model, fitted, limits)
+    return calibration_of(model, fitted, before, settings, other)

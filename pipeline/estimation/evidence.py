@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from pipeline.estimation.least_squares import cholesky
+from pipeline.estimation.engine import cholesky
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -51,9 +51,14 @@ from pipeline.estimation.design import (
     stepped,
     without_unknown_motion,
 )
-from pipeline.estimation.engine import MIN_EIGENVALUE_SHARE, ErrorMixture, ResidualNoise, noise_outside_known_errors
+from pipeline.estimation.engine import (
+    MIN_EIGENVALUE_SHARE,
+    ErrorMixture,
+    ResidualNoise,
+    convergence_evidence,
+    noise_outside_known_errors,
+)
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, selection_grid
-from pipeline.estimation.least_squares import convergence_evidence
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.observations import Observations, observe, weighted

@@ -32,9 +32,8 @@ import numpy as np
 from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.core.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageResult, Values
 from pipeline.estimation.candidates import bench_effects
-from pipeline.estimation.engine import LinearMap
+from pipeline.estimation.engine import LinearMap, ScaledColumns, linear_convergence_evidence
 from pipeline.estimation.generalized_least_squares import fit_joint
-from pipeline.estimation.least_squares import ScaledColumns, linear_convergence_evidence
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.stages import FitStage

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError
+from pipeline.estimation.engine import ScaledColumns
 from pipeline.estimation.gauss_markov import Blocks, WanderPrior
-from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.physics.kinematics import table_motion
 from pipeline.physics.signal.rests import RATE_AT_REST_DPS, runs

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from pipeline.app.commands import add
+from pipeline.app.commands.add import set_override
 from pipeline.app.config.campaign import load_campaign
-from pipeline.app.config.devices import set_override
 from pipeline.app.steps.diagnose import effect_file
 from pipeline.core.errors import ConfigurationError, MissingInputError, PipelineError
 from pipeline.physics.effects import read_effect_file

@@ -28,9 +28,18 @@ from pipeline.evaluation.diagnosis.formula_discovery import (
     suggested_effect,
     why_not_suggested,
 )
-from pipeline.evaluation.diagnosis.functional_forms import Factor, Form, Span, columns_of, harmonic, power, step
+from pipeline.evaluation.diagnosis.functional_forms import (
+    Factor,
+    Form,
+    ProjectedCurves,
+    Scan,
+    Span,
+    columns_of,
+    harmonic,
+    power,
+    step,
+)
 from pipeline.evaluation.diagnosis.residual_dependence import dependences
-from pipeline.evaluation.diagnosis.residual_regression import ProjectedCurves, Scan
 from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.physics.effects import effect_from, forget, register
 from pipeline.physics.kinematics import reference_motion

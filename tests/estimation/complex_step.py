@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.least_squares import (
+from pipeline.estimation.engine import (
     COSINE_AT_MINIMUM,
     STEP_AT_MINIMUM,
     ScaledColumns,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.errors import NotObservableError
-from pipeline.estimation.least_squares import ScaledColumns, cholesky
+from pipeline.estimation.engine import ScaledColumns, cholesky
 from tests.estimation.complex_step import jacobian_of, solve_linear, solve_nonlinear
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.records import SensorCalibration
-from pipeline.estimation.least_squares import convergence_evidence
+from pipeline.estimation.engine import convergence_evidence
 from pipeline.estimation.table_errors import type_b
 from pipeline.estimation.uncertainty_budget import combined, scatter_contribution
 from pipeline.output.pages.pages import template

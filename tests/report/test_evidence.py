@@ -13,10 +13,18 @@ from unit_settings import sheet_of
 from pipeline.core.records import Recording
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.output.pages.chart import scaled
-from pipeline.output.pages.diagnosis_section import _column_unit, added_variable, ranking, unexplained
 from pipeline.output.pages.held_out_section import allan, error_steps, remarks, term_rows
 from pipeline.output.pages.pages import Scale, number
-from pipeline.output.pages.residual_section import harmonic_noise, harmonics, residual_figures, residuals
+from pipeline.output.pages.residual_section import (
+    _column_unit,
+    added_variable,
+    harmonic_noise,
+    harmonics,
+    ranking,
+    residual_figures,
+    residuals,
+    unexplained,
+)
 from pipeline.output.pages.unit_page import render
 
 from .conftest import SIGMA, Unit, build_unit, diagnosis_of

@@ -5,7 +5,7 @@ from html import unescape
 from typing import Any
 
 from pipeline.output.pages import unit_page
-from pipeline.output.pages.run_section import LINK_MARK, MARK, runs_data, with_history
+from pipeline.output.pages.fleet import LINK_MARK, MARK, runs_data, with_history
 
 from .conftest import Unit
 

@@ -13,8 +13,8 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from pipeline.output.pages import campaign_page, unit_page
 from pipeline.output.pages.chart import Figure, LineMark, Panel, SampleMarks, chart
+from pipeline.output.pages.fleet import runs_data
 from pipeline.output.pages.pages import asset
-from pipeline.output.pages.run_section import runs_data
 
 from .conftest import build_unit
 

@@ -27,8 +27,8 @@ from scipy import stats
 from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.effects import model_of
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.estimation.multi_position.effects import model_of
 from pipeline.estimation.multi_position.selection import SelectionByHand
 from pipeline.estimation.noise import estimate_noise
 from pipeline.ingest.read import read_recordings

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.app.commands import parser_of
-from pipeline.app.planning.changes import readme
+from pipeline.app.planning.plan import readme
 from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.files import CONFIGS
 from pipeline.core.records import SENSOR_UNITS, SENSORS
-from pipeline.ingest.recordings_sheet import EXAMPLE
+from pipeline.ingest.files import EXAMPLE
 from pipeline.output.outcome import run_command
 from pipeline.output.pages.pages import template
 from pipeline.physics.sensor_file import settings_of_ranges

@@ -31,9 +31,16 @@ from pipeline.ingest.digests import digests_in_pack
 from pipeline.output.history import of_units, record
 from pipeline.output.pages.campaign_page import render
 from pipeline.output.pages.comparison import against_truth, section
-from pipeline.output.pages.fleet import fleet_statistics, parameter_table, write_parameters, write_summary
+from pipeline.output.pages.fleet import (
+    fleet_statistics,
+    parameter_table,
+    runs_data,
+    times_of,
+    with_history,
+    write_parameters,
+    write_summary,
+)
 from pipeline.output.pages.parameters import Parameter
-from pipeline.output.pages.run_section import runs_data, times_of, with_history
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -49,16 +49,23 @@ from pipeline.core.records.calibration import (
     corrected,
     fit_from_json,
 )
-from pipeline.core.records.diagnosis import (
+from pipeline.core.records.evaluation import (
+    Agreement,
     Answer,
     Candidate,
     Dependence,
     FittedForm,
+    LimitCheck,
     MethodError,
+    OverTemperature,
     RankedFormula,
     SelectionErrors,
     SensorDiagnosis,
+    SensorValidation,
+    StepErrors,
     TableEvidence,
+    TemperatureBin,
+    Validation,
     Wander,
 )
 from pipeline.core.records.recording import (
@@ -81,6 +88,7 @@ from pipeline.core.records.recording import (
     once_of_log,
     rate_of_attitude,
 )
+<<<<<<< HEAD
 from pipeline.core.records.validation import (
     Agreement,
     LimitCheck,
@@ -91,6 +99,8 @@ from pipeline.core.records.validation import (
     TemperatureBin,
     Validation,
 )
+=======
+>>>>>>> 582cf241 (More small modules join the module that uses them)
 
 __all__ = [
     "AFTER_BASE",

@@ -42,9 +42,8 @@ from pipeline.core.records import (
     base_values,
     coverage_factor,
 )
-from pipeline.estimation.engine import LinearMap
+from pipeline.estimation.engine import LinearMap, ScaledColumns
 from pipeline.estimation.gauss_markov import WHITE_SETTING, WanderPrior
-from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
 from pipeline.estimation.multi_position.accelerometer import (
     KNOWN_BY_LIMIT,

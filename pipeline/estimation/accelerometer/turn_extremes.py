@@ -38,7 +38,7 @@ import numpy as np
 
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import AXES, CorrectionStep, Mask, TwoSided, Values
-from pipeline.estimation.least_squares import ScaledColumns, convergence_evidence, linear_convergence_evidence
+from pipeline.estimation.engine import ScaledColumns, convergence_evidence, linear_convergence_evidence
 from pipeline.estimation.turns import TurnPart, filtered_alike
 
 if TYPE_CHECKING:

@@ -51,8 +51,7 @@ from pipeline.core.records import (
     Subtract,
     Values,
 )
-from pipeline.estimation.engine import LinearMap, derivative
-from pipeline.estimation.least_squares import ScaledColumns, linear_convergence_evidence
+from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative, linear_convergence_evidence
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.multi_position.moves import trapezoids
 from pipeline.estimation.noise import wander_prior

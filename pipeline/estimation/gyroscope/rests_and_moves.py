@@ -32,9 +32,10 @@ from pipeline.core.records import (
     StageResult,
     Subtract,
 )
-from pipeline.estimation.least_squares import ScaledColumns
+from pipeline.core.records import BASE_COUNT, MATRIX, MATRIX_NAMES, Multiply, SensorCalibration, StageResult, Subtract
+from pipeline.estimation.effects import accelerometer_of, frame_error
+from pipeline.estimation.engine import ScaledColumns
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
-from pipeline.estimation.multi_position.effects import accelerometer_of, frame_error
 from pipeline.estimation.multi_position.fit import MIN_NEW_NORM_SHARE, with_limits
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, MOVED, model_of

@@ -41,8 +41,7 @@ from pipeline.core.records import (
     corrected,
     motion_at_rest,
 )
-from pipeline.estimation.engine import LinearMap, derivative
-from pipeline.estimation.least_squares import ScaledColumns, convergence_evidence
+from pipeline.estimation.engine import LinearMap, ScaledColumns, convergence_evidence, derivative
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.stages import FitStage, staged_result
 from pipeline.estimation.table_errors import Reference

@@ -42,8 +42,7 @@ import numpy as np
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
-from pipeline.estimation.engine import ErrorMixture
-from pipeline.estimation.least_squares import MAX_STEP_HALVINGS
+from pipeline.estimation.engine import MAX_STEP_HALVINGS, ErrorMixture
 from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, stepped
 
 if TYPE_CHECKING:

@@ -32,8 +32,7 @@ import numpy as np
 import scipy
 
 from pipeline.core.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX
-from pipeline.estimation.engine import draw_normal
-from pipeline.estimation.least_squares import cholesky
+from pipeline.estimation.engine import cholesky, draw_normal
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, SMALLEST_NOISE, white_of
 from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, turns_of
 from pipeline.estimation.multi_position.model import (

@@ -37,8 +37,8 @@ import scipy
 
 from pipeline.core.records import BIAS, Index, Mask, Motion, Noise, Values, base_values, matrix_of
 from pipeline.estimation import design
+from pipeline.estimation.engine import cholesky
 from pipeline.estimation.gauss_markov import NO_INSTABILITY_ODDS, Setting, WanderPrior, block_covariance, selection_grid
-from pipeline.estimation.least_squares import cholesky
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

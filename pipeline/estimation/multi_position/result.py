@@ -17,8 +17,7 @@ import numpy as np
 import scipy
 
 from pipeline.core.records import Contribution, Recording, SensorCalibration, StageResult, Values, base_values
-from pipeline.estimation.engine import draw_normal, scaled_inverse
-from pipeline.estimation.least_squares import convergence_evidence
+from pipeline.estimation.engine import convergence_evidence, draw_normal, scaled_inverse
 from pipeline.estimation.monte_carlo import quadratic_results, with_trials
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of

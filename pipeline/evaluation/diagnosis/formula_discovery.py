@@ -35,9 +35,8 @@ from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import without_each_recording, without_rows
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.evaluation.diagnosis import functional_forms as forms
-from pipeline.evaluation.diagnosis.functional_forms import Form, Span
+from pipeline.evaluation.diagnosis.functional_forms import Form, FormGain, ProjectedCurves, Scan, Span
 from pipeline.evaluation.diagnosis.residual_dependence import dependences
-from pipeline.evaluation.diagnosis.residual_regression import FormGain, ProjectedCurves, Scan
 from pipeline.evaluation.diagnosis.words import listed
 from pipeline.physics.effects import catalogue, effect_from, forget, register
 from pipeline.physics.effects.base import unit_of

@@ -26,9 +26,9 @@ from pipeline.core.records import Dependence, UnitRecordings
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.effects import model_of
+from pipeline.estimation.engine import ScaledColumns, cholesky
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
-from pipeline.estimation.least_squares import ScaledColumns, cholesky
-from pipeline.estimation.multi_position.effects import model_of
 from pipeline.estimation.multi_position.fit import (
     CEILING_TO,
     COMPARED_STEP,
@@ -179,7 +179,7 @@ def require_model(
     settings: Settings,
     accelerometer: SensorCalibration | None = None,
 ) -> Model:
-    """Return the model of rests and moves; see ``pipeline.estimation.multi_position.effects.model_of``.
+    """Return the model of rests and moves; see ``pipeline.estimation.effects.model_of``.
 
     Raises ``NotObservableError`` if there are no rests, or if they do not determine bias and matrix.
     """

@@ -14,14 +14,6 @@ from pipeline.core.records import AXES, BIAS, MATRIX, SENSOR_UNITS, SENSORS, Rec
 from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, css_class, error_of, kinds_of
 from pipeline.output.outcome import apply_command, as_overrides, commands_of, found_mountings, place, run_command
 from pipeline.output.pages.chart import ChartLayer, Figure, LineMark, Panel, chart
-from pipeline.output.pages.diagnosis_section import (
-    added_variable,
-    limit_rows,
-    ranking,
-    ranking_rows,
-    unexplained,
-    upper_limits,
-)
 from pipeline.output.pages.held_out_section import (
     allan,
     attitude_over_time,
@@ -35,7 +27,17 @@ from pipeline.output.pages.held_out_section import (
 )
 from pipeline.output.pages.pages import NOTHING, measured_row, number, scale_of, template
 from pipeline.output.pages.parameters import fitted_parameters, parameter_rows, summary_row
-from pipeline.output.pages.residual_section import measurement_and_model, residual_figures, residuals
+from pipeline.output.pages.residual_section import (
+    added_variable,
+    limit_rows,
+    measurement_and_model,
+    ranking,
+    ranking_rows,
+    residual_figures,
+    residuals,
+    unexplained,
+    upper_limits,
+)
 from pipeline.physics.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 from pipeline.physics.signal.rests import Rest, rests_from_table
 
