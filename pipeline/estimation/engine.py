@@ -31,16 +31,16 @@ where
     sigma : standard deviation of one residual: given, or sqrt(|r|^2 / (n - p))
 
 Columns are scaled to unit norm d, so that units do not matter, and factorised as ``A = Q U diag(s) V^T diag(d)``; the
-singular values s show which combinations the data determine. The nonlinear problem is solved by Gauss-Newton steps,
-halved while they do not lower ``|r|``. The certificate of a minimum is the largest cosine between the residual and a
-column of the Jacobian, which is zero at a minimum (Bates & Watts, Nonlinear Regression Analysis, 1988, section 2.2.3).
+singular values s show which combinations the data determine. The certificate of a minimum is the largest cosine between
+the residual and a column of the Jacobian, which is zero at a minimum (Bates & Watts, Nonlinear Regression Analysis,
+1988, section 2.2.3).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -382,14 +382,10 @@ def derivative(function: Callable[[Values], Values], x: Values, step: Values) ->
     return np.stack([(function(x + h) - function(x - h)) / (2.0 * h.sum()) for h in steps], axis=-1)
 
 
-FitState = TypeVar("FitState")
-MAX_STEP_HALVINGS = 30  # of a step; a smaller one is rounding
 RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
 PART_OF_NULL_SPACE = 1e-3  # component of a unit vector of it, above which a parameter is named as not determined
 COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, times a factor for sums over many residuals
-STEP_AT_MINIMUM = 1e-10  # relative; well below any uncertainty, well above rounding
 ROW_SUM_RIDGE = 1e-9  # 1e7 times the rounding of a double, for sums over many rows; 3e-5 of a standard deviation
-SUM_OF_SQUARES_ROUNDING = 1e-10  # relative, of a sum of squares of small differences of large values
 
 
 @dataclass(frozen=True)
@@ -468,48 +464,6 @@ def cholesky(matrix: Values) -> Values:
     except np.linalg.LinAlgError:
         diagonal = np.einsum("...kk->...k", matrix)[..., None] * np.eye(matrix.shape[-1])
         return np.asarray(np.linalg.cholesky(matrix + ROW_SUM_RIDGE * diagonal), np.float64)
-
-
-def gauss_newton(  # noqa: PLR0917  (what an iteration is)
-    residual_at: Callable[[FitState], tuple[Values, Values]],
-    start: FitState,
-    moved: Callable[[FitState, Values], tuple[FitState, Values]],
-    small: Callable[[Values, ScaledColumns], bool] | None,
-    iterations: int,
-    tolerance: float = RANK_TOLERANCE,
-) -> tuple[FitState, tuple[Values, Values], int]:
-    """Minimise ``|r|`` by Gauss-Newton steps, each halved while it does not lower ``|r|``.
-
-    ``residual_at``: state to its residuals (n,) and their derivative (n, p). ``moved``: state and step (p,) to the new
-    state, and the step taken. ``small``: whether a step, with the factors of the derivative, is the last; by default a
-    step of the size of rounding. ``tolerance``: see ``ScaledColumns``. Returns the final state, its residuals and
-    derivative, and the number of steps. Raises ``NotObservableError`` if the start is not finite.
-    """
-    state, (r, J), size = start, residual_at(start), np.inf
-    if not (np.all(np.isfinite(r)) and np.all(np.isfinite(J))):
-        raise NotObservableError(
-            "residuals or their derivatives are not finite at the start: give a start nearer the solution, or "
-            "check the readings for values that are not finite"
-        )
-    for count in range(iterations):
-        factors = ScaledColumns.of(J, tolerance)
-        step, before = -factors.solve(r), r @ r
-        for halving in range(MAX_STEP_HALVINGS):
-            new, taken = moved(state, step * 0.5**halving)
-            r_new, J_new = residual_at(new)
-            # Near the minimum the sum of squares is flat to rounding while the step is still larger than rounding.
-            if r_new @ r_new < before * (1.0 + (SUM_OF_SQUARES_ROUNDING if halving == 0 else 0.0)) and np.all(
-                np.isfinite(J_new)
-            ):
-                break
-        else:
-            return state, (r, J), count
-        size, last = float(np.linalg.norm(taken * factors.scale)), size
-        stalled = size >= last and r_new @ r_new >= (1.0 - SUM_OF_SQUARES_ROUNDING) * before
-        state, r, J = new, r_new, J_new
-        if small(taken, factors) if small else stalled or size <= STEP_AT_MINIMUM * np.linalg.norm(r):
-            return state, (r, J), count + 1
-    return state, (r, J), iterations
 
 
 def linear_convergence_evidence(A: Values, residual: Values, condition: float, rank: int) -> dict[str, Any]:

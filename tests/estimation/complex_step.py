@@ -9,17 +9,18 @@ import numpy as np
 
 from pipeline.estimation.engine import (
     COSINE_AT_MINIMUM,
-    STEP_AT_MINIMUM,
     ScaledColumns,
-    gauss_newton,
     linear_convergence_evidence,
 )
+from pipeline.estimation.multi_position.fit import MAX_STEP_HALVINGS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     Function = Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]
 
+STEP_AT_MINIMUM = 1e-10  # relative; well below any uncertainty, well above rounding
+SUM_OF_SQUARES_ROUNDING = 1e-10  # relative, of a sum of squares of small differences of large values
 STEP = 1e-30  # there is no difference, so that nothing cancels (Squire & Trapp, SIAM Review 40, 1998)
 
 
@@ -75,9 +76,24 @@ def solve_linear(A: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> Solved:
 
 
 def solve_nonlinear(residuals: Function, start: np.ndarray, jacobian: Function, steps: int = 50) -> Solved:
-    """Return the minimum of ``|residuals(x)|`` near a start."""
+    """Return the minimum of ``|residuals(x)|`` near a start, by halved Gauss-Newton steps."""
     with np.errstate(all="ignore"):  # steps that overflow do not lower the sum of squares
-        x, (r, J), _ = gauss_newton(
-            lambda x: (residuals(x), jacobian(x)), np.array(start, float), lambda x, step: (x + step, step), None, steps
-        )
+        x, size = np.array(start, float), np.inf
+        r, J = residuals(x), jacobian(x)
+        for _ in range(steps):
+            factors = ScaledColumns.of(J)
+            step, before = -factors.solve(r), r @ r
+            for halving in range(MAX_STEP_HALVINGS):
+                taken = step * 0.5**halving
+                r_new, J_new = residuals(x + taken), jacobian(x + taken)
+                allowed = before * (1.0 + (SUM_OF_SQUARES_ROUNDING if halving == 0 else 0.0))
+                if r_new @ r_new < allowed and np.all(np.isfinite(J_new)):
+                    break
+            else:
+                break
+            size, last = float(np.linalg.norm(taken * factors.scale)), size
+            stalled = size >= last and r_new @ r_new >= (1.0 - SUM_OF_SQUARES_ROUNDING) * before
+            x, r, J = x + taken, r_new, J_new
+            if stalled or size <= STEP_AT_MINIMUM * np.linalg.norm(r):
+                break
     return Solved(x, J, r)

@@ -95,11 +95,6 @@ def test_a_search_cut_short_is_not_called_converged() -> None:
     assert fit.cosine > 1e-3
 
 
-def test_a_start_where_nothing_is_finite_is_refused() -> None:
-    with pytest.raises(NotObservableError, match="not finite at the start"):
-        solve_nonlinear(lambda x: np.log(x - 1.0), np.array([1.0]), lambda x: 1.0 / (x[None] - 1.0))
-
-
 def test_the_weights_are_the_pseudo_inverse_and_solve_all_channels() -> None:
     rng = np.random.default_rng(4)
     A, y = rng.normal(size=(12, 3)), rng.normal(size=(12, 2))

@@ -1,4 +1,4 @@
-"""Validation of a unit, the errors of both calibrations on held-out motion, and diagnosis of a sensor; their JSON forms."""
+"""Validation of a unit (errors of both calibrations on held-out motion) and diagnosis of a sensor; their JSON forms."""
 
 from __future__ import annotations
 

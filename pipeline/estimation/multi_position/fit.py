@@ -42,7 +42,7 @@ import numpy as np
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
-from pipeline.estimation.engine import MAX_STEP_HALVINGS, ErrorMixture
+from pipeline.estimation.engine import ErrorMixture
 from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, stepped
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 
 
 # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
+MAX_STEP_HALVINGS = 30  # of a step; a smaller one is rounding
 MIN_NEW_NORM_SHARE = 1e-3
 NEGLIGIBLE_LOG_LIKELIHOOD = 12.0  # of log L below the best: a weight of 6e-6
 PREDICTED_TO = 4.0  # of log L by a linear model: 9 of 10 fits of 13 simulated units differ by less than 0.5
