@@ -64,18 +64,8 @@ NO_SENSOR = {
     "transform", "transforms", "orientation", "quaternion", "quat", "euler", "pose", "position",
 }  # fmt: skip
 COUNTER_WORDS = {
-    "counter",
-    "count",
-    "number",
-    "packet",
-    "packets",
-    "seq",
-    "sequence",
-    "sample",
-    "samples",
-    "index",
-    "frame",
-}
+    "counter", "count", "number", "packet", "packets", "seq", "sequence", "sample", "samples", "index", "frame",
+}  # fmt: skip
 BODY_RATES = ("p", "q", "r")  # about x, y and z, in aeronautics (ISO 1151-1)
 COMMENTS = ("#", "%", "//")  # starts of lines that are no data
 NOT_FINITE = ("", "nan", "-nan", "inf", "-inf", "+inf", "null", "none")  # cells without a number

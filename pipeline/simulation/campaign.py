@@ -367,18 +367,8 @@ def _procedure_text(name: str, course: Course) -> str:
 
 
 UNITS_CSV_COLUMNS = (
-    "unit",
-    "serial",
-    "lot",
-    "date",
-    "sensor",
-    "table",
-    "procedure",
-    "method",
-    "ingest",
-    "filter",
-    "overrides",
-)
+    "unit", "serial", "lot", "date", "sensor", "table", "procedure", "method", "ingest", "filter", "overrides",
+)  # fmt: skip
 CAMPAIGN_YAML = "# Hydra overrides for all units of this campaign.\noverrides: []\n"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -150,9 +150,18 @@ class SensorValidation:
         )
 
 
+FEWEST_MOVES = 6  # held-out moves whose mean error counts: of fewer, one slip is a large share
 KEYS_AS_THEY_ARE = (
     "unit", "held_out", "reason", "samples", "noise_floor", "vector_noise_floor", "reference_rms", "worse_than_raw",
 )  # fmt: skip
+
+
+class MovesError(NamedTuple):
+    """Errors of gravity's direction after held-out moves by hand."""
+
+    rms_deg: float
+    largest_deg: float  # largest rms that noise, scatter and uncertainties explain
+    over_noise: float = 1.0  # mean error over that of noise alone; 1 for fewer than ``FEWEST_MOVES``
 
 
 @dataclass(frozen=True)
@@ -165,10 +174,14 @@ class Validation:
     gravity_direction: dict[str, Any]
 
     @property
-    def moves_error(self) -> tuple[float, float] | None:
-        """Rms error of gravity's direction after held-out moves, deg, and the largest expected one."""
-        largest = self.gravity_direction.get("largest_expected_rms_deg")
-        return None if largest is None else (self.gravity_direction["rms_deg"]["after"], largest)
+    def moves_error(self) -> MovesError | None:
+        """Errors after held-out moves by hand; None without them, or where the fit does not determine the matrix."""
+        found = self.gravity_direction
+        if "largest_expected_rms_deg" not in found:
+            return None
+        several, floor = found["moves"] >= FEWEST_MOVES, found["noise_floor_deg"]
+        over = found["mean_deg"]["after"] / floor if several and floor > 0.0 else 1.0
+        return MovesError(found["rms_deg"]["after"], found["largest_expected_rms_deg"], over)
 
     def to_json(self) -> dict[str, Any]:
         """Return the document."""

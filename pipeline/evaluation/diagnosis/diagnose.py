@@ -34,8 +34,8 @@ import numpy as np
 from pipeline.core.errors import ConvergenceError, NotObservableError
 from pipeline.core.records import (
     MATRIX,
-    MovesError,
     FittedEffect,
+    MovesError,
     Noise,
     Recording,
     SensorCalibration,
