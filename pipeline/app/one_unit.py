@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from pipeline.core.verdicts import error_of
 
 import numpy as np
 import scipy.linalg  # noqa: F401  (loads its library of linear algebra, so that ``environment`` limits its threads)
@@ -41,6 +40,7 @@ from pipeline.core.files import write_atomically
 from pipeline.core.pack import as_bytes
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Values
 from pipeline.core.settings import UserEffectFiles
+from pipeline.core.verdicts import error_of
 from pipeline.ingest.axis_maps import in_body_axes, maps_of_log
 from pipeline.ingest.files import SHEET, candidate_files, sheet_of_mapping, with_sheet, wrong_name
 from pipeline.ingest.read import IN_MEMORY, of_one_sensor, tried

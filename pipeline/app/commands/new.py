@@ -15,8 +15,7 @@ from pipeline.ingest.files import EXAMPLE
 from pipeline.output.outcome import run_command
 from pipeline.output.pages.pages import template
 from pipeline.physics.sensor_file import settings_of_ranges
-from pipeline.simulation.description import UnitDescription, described, read_option, shipped_settings
-from pipeline.simulation.description import TABLE_PROCEDURES, UnitDescription, read_option, shipped_settings
+from pipeline.simulation.description import TABLE_PROCEDURES, UnitDescription, described, read_option, shipped_settings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

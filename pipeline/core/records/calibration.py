@@ -24,16 +24,11 @@ import numpy as np
 from imu_logs.units import SENSOR_UNITS
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.records.budget import (
-    LIMIT,
-    LINEAR,
-    Budget,
-    BudgetLine,
-    finite,
-    unlimited,
     BASE,
     BASE_NAMES,
     BIAS,
     LIMIT,
+    LINEAR,
     Budget,
     BudgetLine,
     Estimate,

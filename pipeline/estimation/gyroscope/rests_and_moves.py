@@ -32,7 +32,6 @@ from pipeline.core.records import (
     StageResult,
     Subtract,
 )
-from pipeline.core.records import BASE_COUNT, MATRIX, MATRIX_NAMES, Multiply, SensorCalibration, StageResult, Subtract
 from pipeline.estimation.effects import accelerometer_of, frame_error
 from pipeline.estimation.engine import ScaledColumns
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT

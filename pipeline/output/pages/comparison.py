@@ -45,7 +45,6 @@ from pipeline.core.records import BASE, BIAS, SENSOR_UNITS, SENSORS, matrix_of
 from pipeline.core.verdicts import error_of
 from pipeline.output.pages.chart import Figure
 from pipeline.output.pages.group_charts import COLOURS, Point, bars, curves
-from pipeline.output.pages.held_out_section import first_and_last_step
 from pipeline.output.pages.pages import measured, number
 from pipeline.output.pages.parameters import fitted_parameters
 

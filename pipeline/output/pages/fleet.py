@@ -50,11 +50,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.core.verdicts import Error
     from numpy.typing import NDArray
 
     from pipeline.core.files import JSON
     from pipeline.core.records import Mask, Values
+    from pipeline.core.verdicts import Error
 
     Texts = NDArray[np.object_]
 
