@@ -276,7 +276,8 @@ def _fitted(
     """
     noise = Noise(rows.white, np.zeros(3), prior.time, "rests")
     model = AccelerometerModel(rows.rests, PLACED, gravity_g, noise, known_by_limit=limits, wander=rows.by_hand)
-    values = _start(rows.rests.reading, gravity_g, tilted=not limits)
+    # Attitudes that do not determine an ellipsoid lie on one far from any sensor.
+    values = IDEAL if partly and limits else _start(rows.rests.reading, gravity_g, tilted=not limits)
     state = State(values[BIAS], triangle(values))
     equations = model.equations(state)
     columns = ScaledColumns.of(equations.base)
