@@ -47,7 +47,6 @@ from pipeline.core.records import (
     BASE_NAMES,
     BIAS,
     LIMIT,
-    LINEAR,
     MATRIX,
     NORMAL,
     RECTANGULAR,
@@ -322,8 +321,7 @@ def limit_contribution(
     bent = 0.5 * np.einsum("iab,jba->ij", HC, HC) + np.outer(mean, mean)
     first = place @ of_limits @ of_limits.T @ place.T
     total = first + place @ gain @ bent @ gain.T @ place.T
-    parts, free = {LINEAR: np.sqrt(np.diag(first))}, np.full(len(total), np.inf)
-    return Contribution(LIMIT, "B", NORMAL, total, free, parts=parts, remark=", ".join(names)), first
+    return Contribution(LIMIT, "B", NORMAL, total, np.full(len(total), np.inf), remark=", ".join(names)), first
 
 
 def combined(

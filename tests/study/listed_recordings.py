@@ -141,6 +141,41 @@ def turns(unit: Unit, sensors: str) -> None:
             unit.write(f"turn_{axis}_{k}", f"turn,{axis},{shown},{accuracy:.3g},", *joined(*parts), sensors)
 
 
+def on_table(unit: Unit, sensors: str, axis: int, logged: str, off_deg: float = 0.1) -> None:
+    """Steps by 45 deg about a body axis, with rests, and back at once, on a table that logs ``angle`` or ``rate``."""
+    e, up = np.eye(3)[axis], np.eye(3)[0 if axis == 2 else 2]
+    e = e + np.radians(off_deg) * unit.rng.normal(size=3) * (np.arange(3) != axis)
+    e /= np.linalg.norm(e)
+    parts, angles, reached = [at_rest(4.0, up)], [np.zeros(round(4.0 * RATE_HZ))], 0.0
+    for step in (*[45.0] * 7, -315.0):
+        start = rotation(e, np.array([-np.radians(reached)]))[0] @ up
+        parts.append(turned(step, 90.0 if step < 0.0 else 30.0, e, start))
+        phase = (np.arange(len(parts[-1][1])) + 0.5) / len(parts[-1][1])
+        angles.append(reached + step * (phase - np.sin(2.0 * np.pi * phase) / (2.0 * np.pi)))
+        reached += step
+        parts.append(at_rest(4.0, rotation(e, np.array([-np.radians(reached)]))[0] @ up))
+        angles.append(np.full(len(parts[-1][1]), reached))
+    force, rate = joined(*parts)
+    name = f"table_{'xyz'[axis]}"
+    unit.write(name, f"table,{'xyz'[axis]},,,", force, rate, sensors)
+    path = unit.folder / f"{name}.csv"
+    column = np.concatenate(angles) if logged == "angle" else rate @ e
+    header, *lines = path.read_text().splitlines()
+    named = "table_angle_deg" if logged == "angle" else "table_rate_dps"
+    rows = [f"{header},{named}", *(f"{line},{v:.7g}" for line, v in zip(lines, column, strict=True))]
+    path.write_text("\n".join(rows) + "\n")
+
+
+def table(unit: Unit, sensors: str, logged: str) -> None:
+    """Turns on a table about x, y and z, and a turn and a rest by hand."""
+    for axis in range(3):
+        on_table(unit, sensors, axis, logged)
+    up, stop = np.eye(3)[2], 360.0 + 0.5 * unit.rng.normal()
+    unit.write("still", "rest,,,,", *at_rest(20.0, up), sensors)
+    turn = joined(at_rest(4.0, up), turned(stop, 90.0, np.eye(3)[0], up), at_rest(4.0, up))
+    unit.write("hand", "turn,x,360,0.5,", *turn, sensors)
+
+
 def attitudes(unit: Unit) -> None:
     """Means of 12 to 50 attitudes of the accelerometer, one row each, averaged over half a second to ten."""
     rng, count = unit.rng, int(unit.rng.integers(12, 51))
@@ -170,6 +205,8 @@ def slow(unit: Unit) -> None:
 KINDS = {
     "turns": lambda unit: turns(unit, "ag"),
     "turns_gyroscope": lambda unit: turns(unit, "g"),
+    "table": lambda unit: table(unit, "ag", "angle"),
+    "table_gyroscope": lambda unit: table(unit, "g", "rate"),
     "attitudes": attitudes,
     "slow": slow,
 }
@@ -182,7 +219,11 @@ def run(kind: str, seed: int, number: int) -> dict[str, list[tuple[str, float, b
         KINDS[kind](unit)
         unit.sheet()
         overrides = ["diagnosis.depth=standard"]
-        found = pipeline.calibrate(unit.folder, sensor="mpu6050", procedure="listed", overrides=overrides).calibration
+        where = "single_axis" if kind.startswith("table") else "hand"
+        overrides += ["table.seat_deg=null"] if where != "hand" else []
+        found = pipeline.calibrate(
+            unit.folder, sensor="mpu6050", table=where, procedure="listed", overrides=overrides
+        ).calibration
     out: dict[str, list[tuple[str, float, bool]]] = {}
     names = [f"bias_{a}" for a in "xyz"] + [f"matrix_{i}{j}" for i in "xyz" for j in "xyz"]
     for sensor in LIMITS:

@@ -14,7 +14,7 @@ from pipeline.core.errors import IngestError, PipelineError, failure_of
 from pipeline.core.pack import FAILED, Pack, as_bytes, new_pack
 from pipeline.ingest.files import candidate_files, recording_files, state_of_recordings
 from pipeline.ingest.read import read_recordings
-from pipeline.physics.signal.segments import cut, held_out_windows
+from pipeline.physics.signal.segments import cut, held_out_windows, logged_turns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -103,6 +103,9 @@ def _ingested(files: UnitFiles, settings: Settings) -> list[Recording]:
     for read in whole:
         entry = procedure.recordings.get(read.name)
         windows = entry.windows if entry else None
+        if entry and procedure.turns and entry.kind == "table":
+            recordings.append(logged_turns(read, settings.table, entry, procedure.turns))
+            continue
         if read.role == "rests" and procedure.turns and not held_out:
             turns = held_out_windows(read, procedure.turns)
             recordings += cut(read, turns, found=True) if turns else [read]

@@ -10,7 +10,6 @@ from pipeline.core.records.budget import (
     BIAS,
     BIAS_NAMES,
     LIMIT,
-    LINEAR,
     MATRIX,
     MATRIX_NAMES,
     MATRIX_ROWS,
@@ -92,7 +91,7 @@ from pipeline.core.records.recording import (
 
 __all__ = [
     "AFTER_BASE", "AXES", "BASE", "BASE_COUNT", "BASE_NAMES", "BETWEEN_ATTITUDES_S", "BIAS", "BIAS_NAMES", "LIMIT",
-    "LINEAR", "MATRIX", "MATRIX_NAMES", "MATRIX_ROWS", "MEDIAN_SIZE", "MONTE_CARLO", "NOISE_OF_ROWS", "NORMAL",
+    "MATRIX", "MATRIX_NAMES", "MATRIX_ROWS", "MEDIAN_SIZE", "MONTE_CARLO", "NOISE_OF_ROWS", "NORMAL",
     "READABLE_VERSIONS", "RECTANGULAR", "SCHEMA_VERSION", "SENSORS", "SENSOR_UNITS", "TURN_AXES", "Agreement", "Answer",
     "Budget", "BudgetLine", "Candidate", "Contribution", "CorrectionStep", "Dependence", "Estimate", "Fit",
     "FittedEffect", "FittedForm", "Index", "Integers", "LimitCheck", "Mask", "MethodError", "MonteCarlo", "Motion",

@@ -128,7 +128,6 @@ class Parameters:
 NORMAL, RECTANGULAR = "normal", "rectangular"
 LIMIT = "not determined by the recordings: limit of the sensor file"  # a source of the uncertainty budget
 TURN_AXES = "turn_axes"  # in the details of a stage: how well the axes of turns by hand are known, and would need to be
-LINEAR = "to first order"  # the part of that source which acts on its own parameters
 MONTE_CARLO = "monte_carlo"  # key of the run in a published budget
 
 

@@ -25,10 +25,10 @@ from imu_logs.units import SENSOR_UNITS
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.records.budget import (
     BASE,
+    BASE_COUNT,
     BASE_NAMES,
     BIAS,
     LIMIT,
-    LINEAR,
     Budget,
     BudgetLine,
     Estimate,
@@ -132,6 +132,7 @@ def corrected(steps: Sequence[CorrectionStep], readings: Values) -> Values:
 
 
 SCHEMA_VERSION = 2  # of published documents; the keys of each version are in pipeline/schemas
+PRODUCT = 0.1  # of a limit: the largest change of one parameter by the limit of others
 READABLE_VERSIONS = (1, 2)  # a key that a document of version 1 lacks counts as null
 
 
@@ -225,11 +226,13 @@ class SensorCalibration:
     def by_limit(self) -> Mask:
         """Whether the sensor file's limit, and not the recordings, determines bias and matrix: (12,) array.
 
-        It causes more than half of the variance; the squares of other parameters, which are small, do not count.
+        It causes more than half of the variance, and more than its products do: open cross-axis terms change a scale
+        factor that is known by some hundredths of their limit.
         """
-        lines = [line for line in self.lines if line.source == LIMIT]
-        of_limit = sum(line.parts.get(LINEAR, line.standard_uncertainty)[BASE] ** 2 for line in lines)
-        return np.asarray(of_limit > 0.5 * np.diag(self.parameters.covariance)[BASE])
+        lines = (line.standard_uncertainty[BASE] for line in self.lines if line.source == LIMIT)
+        u = next(lines, np.zeros(BASE_COUNT))
+        half = np.sqrt(0.5 * np.diag(self.parameters.covariance)[BASE])
+        return np.asarray((u > half) & (u > PRODUCT * u.max()))
 
     def to_json(self) -> dict[str, Any]:
         """Return the part of ``calibrations/<unit>.json`` for this sensor."""

@@ -193,7 +193,8 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     if model.turns is not None:
         details["turns"] = model.turns.described(fitted.state)
         off = fitted.residual * fitted.error
-        if sheet and procedure.turns:
+        by_hand = settings.table.motion == "none" or any(r.kind == "turn" for r in filtered)
+        if sheet and procedure.turns and by_hand:
             needed = CLEARLY_BELOW * float(np.degrees(data_sheet.cross_axis / np.sqrt(3.0)))
             details[TURN_AXES] = {"stated_deg": procedure.turns.axis_accuracy_deg, "needed_deg": needed}
         details["departures"] = model.turns.departures(off[model.of_turns], fitted.deviation[model.of_turns])

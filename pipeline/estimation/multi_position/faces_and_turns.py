@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from pipeline.core.records import Index, Recording, Values
     from pipeline.core.settings import FacesByHand as StatedFaces
-    from pipeline.core.settings import HandTurns, Procedure
+    from pipeline.core.settings import Procedure
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.rest_means import Rests
 
@@ -378,11 +378,9 @@ def turns_of(
     ``frame_deg``: standard uncertainty of each angle between the frame of the fit and the case, deg.
     """
     chosen = stated_turns(recordings, rests, procedure, role)
-    if not chosen or procedure.turns is None:
+    if not chosen:
         return None
-    accuracy = float(np.hypot(procedure.turns.axis_accuracy_deg, frame_deg))
-    turns = procedure.turns.replaced(axis_accuracy_deg=accuracy)
-    found = _gathered(recordings, chosen, accelerometer, turns)
+    found = _gathered(recordings, chosen, accelerometer, frame_deg)
     return replace(found, by_length=procedure.sheet is not None)
 
 
@@ -390,9 +388,9 @@ def _gathered(
     recordings: Sequence[Recording],
     chosen: Sequence[StatedTurn],
     accelerometer: SensorCalibration | None,
-    turns: HandTurns,
+    frame_deg: float,
 ) -> TurnsByHand:
-    """Return the samples of turns, and their equations."""
+    """Return the samples of turns, and their equations; ``frame_deg``: see ``turns_of``."""
     pairs = [(recordings[t.recording], at) for t, at in zip(chosen, padded([t.span for t in chosen]), strict=True)]
     force = [
         np.zeros((len(at), 3))
@@ -404,7 +402,8 @@ def _gathered(
     times = np.array([r.time[at] for r, at in pairs])
     direction, stated = np.array([t.direction for t in chosen]), np.array([t.angle for t in chosen])
     cosine = direction @ direction.T
-    group = np.argmax(np.abs(cosine) > ONE_LINE, axis=1)
+    accuracy = np.array([t.axis_error for t in chosen])
+    group = np.argmax((np.abs(cosine) > ONE_LINE) & (accuracy[:, None] == accuracy), axis=1)
     rows = [np.outer(turn, e) for turn, e in zip(np.eye(len(chosen)), direction, strict=True)]
     value, error = stated.tolist(), [t.error for t in chosen]
     for first in np.unique(group):
@@ -412,7 +411,7 @@ def _gathered(
         share = np.degrees(signed / np.sum(signed * stated * cosine[first]))
         rows += [share[:, None] * e for e in across_axis(direction[first])]
         value += [0.0, 0.0]
-        error += 2 * [turns.axis_accuracy_deg]
+        error += 2 * [float(np.hypot(accuracy[first], frame_deg))]
     return TurnsByHand(
         name=tuple(r.name for r, _ in pairs),
         recording=np.array([t.recording for t in chosen]),

@@ -64,6 +64,7 @@ SETTLES_DEVIATIONS = 6.0  # standard deviations by the scatter between rests; pu
 SETTLING_TIMES_S = np.geomspace(0.05, 3.0, 40)  # T; shorter ones have settled where the variance is low
 SETTLED_SHARE = 0.1  # of the noise of the mean of all rests, see above
 
+RESTS = "rests"  # in the source of a recording on a table (of a sheet): start and stop of each rest by its log
 RATE_AT_REST = "rate_at_rest_dps"  # in the source of a turn: what the gyroscope reads in the recordings at rest
 SLOW_PARTS, SLOW_PART_S = 120, 0.2  # parts of slow movement: a turn at 30 deg/s shortens their mean by 0.5 mg
 SOAK_PARTS = 40  # of a soak: over a span of 80 degC, 2 degC each
@@ -137,8 +138,11 @@ def find_rests(recording: Recording) -> list[Rest]:
 
     A rest in which the sensor moved is marked as refused, with the reason. If a sheet states the kind of the recording,
     ``rest`` is one rest, the longest or, if none is found, the whole; ``soak`` parts of equal length, in which the
-    temperature hardly changes; ``slow`` short parts, for the length of gravity alone; ``attitudes`` the blocks of rows.
+    temperature hardly changes; ``table`` those by the log; ``slow`` short parts, for the length of gravity alone;
+    ``attitudes`` the blocks of rows.
     """
+    if recording.kind == "table":
+        return [Rest(start, stop) for start, stop in recording.source.get(RESTS, ())]
     if recording.kind == "soak":
         edges = np.linspace(0, recording.samples, min(SOAK_PARTS, recording.samples) + 1).astype(int)
         return [Rest(a, b) for a, b in pairwise(edges.tolist())]

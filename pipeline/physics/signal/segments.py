@@ -37,12 +37,21 @@ import numpy as np
 from pipeline.core.errors import InputError
 from pipeline.core.records import AXES, Mask, Note, Recording, Values, rate_of_attitude
 from pipeline.core.settings import Window
-from pipeline.physics.signal.rests import RATE_AT_REST_DPS, SHORTEST_REST_S, WINDOW_S, find_rests, runs
+from pipeline.physics.signal.rests import (
+    RATE_AT_REST_DPS,
+    RESTS,
+    SETTLING_S,
+    SHORTEST_REST_S,
+    WINDOW_S,
+    find_rests,
+    runs,
+    still_samples,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.core.settings import HandTurns
+    from pipeline.core.settings import HandTurns, RecordingFile, Table
     from pipeline.physics.signal.rests import Rest
 
 FEWEST_STOPS = 4  # attitudes about one axis that determine a bias and a row of the matrix
@@ -57,6 +66,9 @@ SHORT_NAMES = {
 ONE_AXIS = 0.8  # share of the energy of a turn about a body axis that is misaligned by 27 deg
 ENCODER_AGREES_DEG, ENCODER_AGREES = 5.0, 0.1  # one sample of 50 ms at 100 deg/s; a coarse log of the rate
 HALF_A_TURN_DEG = 180.0
+LEAST_TURNED_DEG, LEAST_ERROR_DEG = 10.0, 1e-4  # of a table's turn that counts; of an angle that is stated as exact
+# in the source of a recording on a table (of a sheet)
+LOGGED_TURNS, AXIS_ACCURACY = "table_turns", "table_axis_accuracy_deg"
 HANDLED_DPS, NEAR_A_MOVE_S = 3.0, 0.5  # above bias and vibration of a resting unit; the logs' clocks may differ
 
 
@@ -115,6 +127,42 @@ def cut(recording: Recording, windows: Sequence[Window] | None = None, *, found:
             )
         )
     return out
+
+
+def logged_turns(recording: Recording, table: Table, entry: RecordingFile, turns: HandTurns) -> Recording:
+    """Return a recording on a table (of a sheet) with its turns and rests in its source, instead of the table's log.
+
+    A turn is a move in one direction, with up to ``SETTLING_S`` of the rests beside it, in which the sensor settles.
+    Each has its samples, its total angle by the log and the standard uncertainty of that, deg. Raises ``InputError``
+    without a log, or without a turn in it.
+    """
+    rate, angle, time = recording.logged_rate, recording.table_angle, recording.time
+    if rate is None or recording.table_attitude is not None:
+        raise InputError(
+            "kind table: the file holds neither the angle nor the rate of a table about one axis; a turn by a known "
+            "angle is of kind turn, a table that logs its attitude needs procedure three_axis_turns",
+            recording.source.get("file"),
+        )
+    margin = int(SETTLING_S / recording.interval)
+    moving = sorted([*runs(rate > RATE_AT_REST_DPS), *runs(rate < -RATE_AT_REST_DPS)])
+    edges = [0, *((a[1] + b[0]) // 2 for a, b in pairwise(moving)), len(rate)]
+    found = []
+    for (start, stop), low, high in zip(moving, edges, edges[1:], strict=False):
+        first, last = max(start - margin, low), min(stop + margin, high - 1)
+        passed = np.trapezoid(rate[first : last + 1], time[first : last + 1])
+        turned = table.sense * float(passed if angle is None else angle[last] - angle[first])
+        by_log = table.rate_accuracy * abs(turned) if angle is None else np.sqrt(2.0) * table.angle_accuracy_deg
+        error = entry.angle_accuracy_deg or (turns.accuracy_deg if table.motion == "none" else float(by_log))
+        if abs(turned) >= LEAST_TURNED_DEG:
+            found.append([first, last + 1, turned, max(error, LEAST_ERROR_DEG)])
+    if not found:
+        raise InputError("kind table: its log shows no turn", recording.source.get("file"))
+    seated = float(np.hypot(table.orthogonality_deg, table.seat_deg or 0.0))
+    axes = turns.axis_accuracy_deg if table.motion == "none" else max(seated, LEAST_ERROR_DEG)
+    still = runs(still_samples(time, rate))
+    rests = [[a, b] for a, b in still if (b - a) * recording.interval >= SHORTEST_REST_S]
+    source = {**recording.source, LOGGED_TURNS: found, RESTS: rests, AXIS_ACCURACY: axes}
+    return replace(recording, table_angle=None, table_rate=None, source=source)
 
 
 def _size_of_rate(part: Recording) -> Values | None:

@@ -12,11 +12,11 @@ import pytest
 
 import pipeline
 from pipeline.app.field_logs.compensate import compensate_log
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, NotObservableError
 from pipeline.core.records import SensorCalibration
 from pipeline.physics.calibration_file import not_determined
 from pipeline.physics.compensation import load
-from tests.study.listed_recordings import Unit, at_rest, joined, turned
+from tests.study.listed_recordings import Unit, at_rest, joined, on_table, run, table, turned
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -132,6 +132,41 @@ def test_a_turn_in_the_other_sense_is_refused_with_the_angle_that_agrees(tmp_pat
     sheet.write_text(sheet.read_text().replace("turn,y,-360", "turn,y,360"))
     with pytest.raises(Exception, match=r"turn_y is no turn about y by 360 deg.*angle_deg -360 would agree"):
         calibrated(tmp_path)
+
+
+@pytest.mark.parametrize(("sensors", "logged"), [("ag", "angle"), ("g", "rate")])
+def test_turns_on_a_table_and_by_hand_are_one_calibration(tmp_path: Path, sensors: str, logged: str) -> None:
+    unit = Unit(tmp_path, np.random.default_rng(11))
+    table(unit, sensors, logged)
+    unit.sheet()
+    overrides = ["table.seat_deg=null", "diagnosis.depth=standard"]
+    result = pipeline.calibrate(tmp_path, sensor=SENSOR, table="single_axis", procedure="listed", overrides=overrides)
+    found = result.calibration
+    for sensor in ("accelerometer", "gyroscope") if sensors == "ag" else ("gyroscope",):
+        assert np.abs(errors(unit, found, sensor, in_case=sensors == "g")).max() < 1.5
+        assert set(np.ravel(found[sensor]["determined_by"]["matrix"])) == {"recordings"}
+    turns_ = found["gyroscope"]["stages"][-1]["details"]["turns"]
+    assert [sum(t["recording"] == name for t in turns_) for name in ("table_x", "table_z", "hand")] == [8, 8, 1]
+    U = np.array(found["gyroscope"]["expanded_uncertainty"]["matrix"])
+    assert np.all(np.diag(U) < 3e-4)  # 0.014 deg of 315, and the bias: the turn by hand alone leaves 3e-3
+    assert result.verdict["gyroscope"] in {"nothing_missing", "not_enough_data"}
+
+
+def test_a_table_that_turned_the_other_way_or_logs_nothing_is_refused(tmp_path: Path) -> None:
+    unit = Unit(tmp_path, np.random.default_rng(12))
+    on_table(unit, "g", 0, "angle")
+    unit.sheet()
+    with pytest.raises(NotObservableError, match=r"no turn about x as the table logged.*axis -x would agree"):
+        calibrated(tmp_path, "table.sense=-1")
+    log = tmp_path / "table_x.csv"
+    log.write_text("\n".join(line.rpartition(",")[0] for line in log.read_text().splitlines()) + "\n")
+    with pytest.raises(InputError, match="neither the angle nor the rate of a table"):
+        calibrated(tmp_path)
+
+
+def test_few_rests_near_a_plane_do_not_lead_away_from_the_sensor_files_limits() -> None:
+    ratios = [ratio for name, ratio, _ in run("turns", 40, 3)["accelerometer"]]
+    assert np.abs(ratios).max() < 1.5  # they were up to 71
 
 
 def test_a_bad_sheet_is_the_error_of_its_unit(tmp_path: Path) -> None:
