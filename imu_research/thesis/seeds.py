@@ -56,11 +56,11 @@ TIME_CONSTANT_S = 0.12  # of campaign.yaml
 INTERVAL_S = 0.12  # of simulation.yaml
 SAME_GAIN_S = (np.sqrt(INTERVAL_S**2 + 2.0 * TIME_CONSTANT_S * (INTERVAL_S + TIME_CONSTANT_S)) - INTERVAL_S) / 2.0
 # Causes of disturbance; each includes the causes before it.
-SHEET = "noise of the sensor file, up to half the sampling rate"
-WHOLE = "noise of the sensor's whole bandwidth, folded into the samples"
+SHEET_NOISE = "noise of the sensor file, up to half the sampling rate"
+WHOLE_BAND_NOISE = "noise of the sensor's whole bandwidth, folded into the samples"
 LOST = "and samples lost on the radio link"
 SHAKEN = "and a table that shakes like the home-made one"
-CAUSES = (SHEET, WHOLE, LOST, SHAKEN)
+CAUSES = (SHEET_NOISE, WHOLE_BAND_NOISE, LOST, SHAKEN)
 SHAKING = {"shaking_g": 0.05, "vibration_hz": 7.3}  # g and Hz, of Mark 2 in simulation.yaml
 Row = dict[str, Any]
 
@@ -105,7 +105,7 @@ class RecordingSet:
             exact = self.shaken
         data_sheet = shipped_settings(sensor=self.unit.sensor).sensor.of(self.sensor)
         given = getattr(self.unit, self.sensor)
-        if cause != SHEET and "noise_density" in given:
+        if cause != SHEET_NOISE and "noise_density" in given:
             data_sheet = data_sheet.replaced(noise_density=given["noise_density"])  # of the whole bandwidth
         lost = self.unit.lost if cause in (LOST, SHAKEN) else 0.0
         link, noise = (np.random.default_rng([seed, self.number, k]) for k in (0, 1 + SENSORS.index(self.sensor)))

@@ -36,7 +36,7 @@ EXPANDED = 3.0  # coverage of a stated standard uncertainty: 99.7 % of a normal 
 OPPOSITE = 0.8  # correlation from which two channels differ in sign alone
 SIGN_BLOCK = 8  # intervals over which both channels show the angle of a short move
 SAMPLED = 0.05  # relative error of an angle summed up from the rate in moves of some samples (1.6 % in 3 deg)
-LEAST_TURN_DEG = 60.0  # for gravity to determine an angle: biases of 0.1 g distort its phase by 6 deg
+MIN_GRAVITY_TURN_DEG = 60.0  # for gravity to determine an angle: biases of 0.1 g distort its phase by 6 deg
 LEAST_SWING_G = 0.5  # radius of gravity's circle from which the axis is level
 FASTEST_DEG = 90.0  # in one interval, beyond which the phase may lose a turn
 LEAST_RATE_DPS = 1.0  # change of a rate from which it determines the gyroscope's scale
@@ -192,7 +192,7 @@ def gravity_turned(recording: Recording) -> Values | None:
         return None
     phase = np.degrees(np.unwrap(np.arctan2(centred[:, 1], centred[:, 0])))
     turned = np.diff(phase)
-    if float(np.ptp(phase)) < LEAST_TURN_DEG or float(quantiles(np.abs(turned), 0.99)[0]) > FASTEST_DEG:
+    if float(np.ptp(phase)) < MIN_GRAVITY_TURN_DEG or float(quantiles(np.abs(turned), 0.99)[0]) > FASTEST_DEG:
         return None
     turned[gaps(recording)] = 0.0
     return np.asarray(turned)

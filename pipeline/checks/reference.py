@@ -249,7 +249,7 @@ SAME_GAIN = 0.1  # relative difference between gains of one gyroscope in two tur
 FURTHEST, FURTHEST_S = 25, 10.0  # samples of delay that are tried at least, and s at most
 DELAY_STEP_S = 0.05  # step in which delays are tried; a parabola finds what lies between
 CLOCKS = 4001  # rates of the clock that are tried: 5 us in 1 s where it may be off by 1 %
-RESTING = 0.01  # of the fastest rate of a turn, below which the table rests
+RESTING_RATE_SHARE = 0.01  # of the fastest rate of a turn, below which the table rests
 QUARTER = 0.25  # of an interval, within which a delay between samples is known
 BETTER = 0.5  # share of the power of the difference of two signals below which they are alike
 NEARLY = 0.1  # share of the power by which one delay has to be better than a smaller one
@@ -431,7 +431,7 @@ def _check_attitude_of_turn(recording: Recording, limits: ChannelLimits) -> None
         return
     speed = np.linalg.norm(spin(recording.table_attitude), axis=1) / np.diff(recording.time)
     fastest = float(quantiles(speed, 0.99)[0])
-    moving, resting = speed > MIN_SHARE_OF_USUAL_GAIN * fastest, speed < RESTING * fastest
+    moving, resting = speed > MIN_SHARE_OF_USUAL_GAIN * fastest, speed < RESTING_RATE_SHARE * fastest
     if min(np.count_nonzero(moving), np.count_nonzero(resting)) >= MIN_REFERENCE_SAMPLES:
         vector = recording.gyroscope - median(recording.gyroscope[1:][resting])
         _check_directions(recording, recording.table_attitude, vector, limits, moving)

@@ -121,8 +121,8 @@ def as_bytes(content: Any) -> bytes:  # noqa: ANN401
 
 PACKS, WITH_PRIOR = "packs", "prior"
 PACKED_STEPS = ("calibration", "validate", "diagnose", "export", "report", "summary")
-FAILED = ".failed.json"
-INCOMPLETE = ".incomplete.json"  # what stages after the fit could not make: a list of records as of a failure
+FAILED_SUFFIX = ".failed.json"
+INCOMPLETE_SUFFIX = ".incomplete.json"  # what stages after the fit could not make: a list of records as of a failure
 STAGE_OF = {  # folder of the results: the stage whose packs contain its files
     "calibrations": "calibration", "validations": "validate", "diagnoses": "diagnose", "exports": "export",
     "reports": "report", "certificates": "report",
@@ -144,11 +144,11 @@ class Batch:
     def failure(self, unit: str) -> dict[str, Any] | None:
         """Return the failure record of a unit, None if it was calibrated."""
         pack = self._of_failed(unit)
-        return cast("dict[str, Any]", pack.json(f"{unit}{FAILED}")) if pack else None
+        return cast("dict[str, Any]", pack.json(f"{unit}{FAILED_SUFFIX}")) if pack else None
 
     def incomplete(self, unit: str) -> list[dict[str, Any]]:
         """Return the records of what could not be made of a calibrated unit."""
-        packs, name = [*self.packs.values(), self.combined], f"{unit}{INCOMPLETE}"
+        packs, name = [*self.packs.values(), self.combined], f"{unit}{INCOMPLETE_SUFFIX}"
         return [record for pack in packs if pack and name in pack for record in pack.json(name)]
 
     @cached_property

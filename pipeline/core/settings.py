@@ -23,7 +23,7 @@ AxisName = Literal["x", "y", "z"]
 SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 AxisMap = Annotated[list[SignedAxis], Field(min_length=3, max_length=3)]
 Sense = Literal[1, -1]
-Kind = Literal["rest", "attitudes", "turn", "moves", "slow", "soak", "table"]  # of a file in the sheet of recordings
+FileKind = Literal["rest", "attitudes", "turn", "moves", "slow", "soak", "table"]  # in the sheet of recordings
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 SettingOfSensor = TypeVar("SettingOfSensor")
 AnySection = TypeVar("AnySection", bound="Section")
@@ -190,7 +190,7 @@ class RecordingFile(Section):
     program: list[ProgramRest | ProgramTurn | Repeated] | None = None
     windows: list[Window] | None = None
     session: Annotated[int, Field(ge=1)] | None = None
-    kind: Kind | None = None
+    kind: FileKind | None = None
     direction: OfAxes | None = None
     angle_deg: Finite | None = None
     angle_accuracy_deg: Positive | None = None

@@ -73,7 +73,7 @@ MOUNTING_UNITS = {"rotation": "deg", "lever_arm": "m", "time_offset": "s"}
 
 
 @dataclass(frozen=True)
-class Error:
+class ChipError:
     """One source of error: its covariance (k, k), and its effect on the fits (q, k) and on the chips' axes (3, k)."""
 
     source: str
@@ -90,7 +90,7 @@ class ChipMounting:
 
     names: list[str]  # (q,)
     values: Values  # (q,)
-    errors: list[Error]  # of these values
+    errors: list[ChipError]  # of these values
     agreement: dict[str, float] | None  # of the rotations by accelerometers and by gyroscopes
 
     @property
@@ -125,7 +125,7 @@ def _rms(values: Values) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _errors(fitted: RotationFits, chips: tuple[Chip, Chip]) -> list[Error]:
+def _errors(fitted: RotationFits, chips: tuple[Chip, Chip]) -> list[ChipError]:
     """Return the sources of error of the fits' parameters, one after the other, without the biases."""
     fits, R, moving = fitted.fits, fitted.R, fitted.moving
     kept = [np.flatnonzero(np.array(fit.names) != "bias") for fit in fits]
@@ -143,10 +143,10 @@ def _errors(fitted: RotationFits, chips: tuple[Chip, Chip]) -> list[Error]:
         rougher = np.where(by_motion, max(in_motion / fit.scale, 1.0), 1.0)
         noise = covariance[np.ix_(k, k)] * np.outer(rougher, rougher)
         of_axes, source = np.zeros((3, len(k))), f"noise of the {fit.sensor}s"
-        errors.append(Error(source, "A", float(freedom[k].min()), noise, place, of_axes))
+        errors.append(ChipError(source, "A", float(freedom[k].min()), noise, place, of_axes))
         weak = np.array([PRIORS[fit.names[i]] ** -2 for i in k])
         pulled = fit.inverse[np.ix_(k, k)]
-        errors.append(Error("weak priors", "B", np.inf, pulled @ np.diag(weak) @ pulled.T, place, of_axes))
+        errors.append(ChipError("weak priors", "B", np.inf, pulled @ np.diag(weak) @ pulled.T, place, of_axes))
     for of in (fit.sensor for fit in fits):
         # Each error of a matrix is a pair of shears E of the chips in the axes of a: their truths are ``u + E u``.
         sources = []
@@ -169,7 +169,9 @@ def _errors(fitted: RotationFits, chips: tuple[Chip, Chip]) -> list[Error]:
             of_axes = np.zeros((3, 9))
             if of == "accelerometer":
                 of_axes = np.stack([_axes_change(chips, R, *E) for E in pairs], axis=1)
-            errors.append(Error(source, kind, degrees, covariance[MATRIX, MATRIX], np.stack(of_fits, axis=1), of_axes))
+            errors.append(
+                ChipError(source, kind, degrees, covariance[MATRIX, MATRIX], np.stack(of_fits, axis=1), of_axes)
+            )
     return errors
 
 
@@ -215,7 +217,7 @@ def _axes_change(chips: Sequence[Chip], R: Values, E_a: Values, E_b: Values) -> 
     return vector_of(less.T @ more) / (2.0 * SHEAR)
 
 
-def _combined(fits: Sequence[RotationFit], errors: Sequence[Error], *, on_table: bool) -> ChipMounting:
+def _combined(fits: Sequence[RotationFit], errors: Sequence[ChipError], *, on_table: bool) -> ChipMounting:
     """Return the best linear estimate by both sensors: one common rotation, and all other parameters.
 
     By hand the axes of a gyroscope are determined by those of its accelerometer, so that the errors of both rotations

@@ -92,7 +92,7 @@ if TYPE_CHECKING:
     from pipeline.core.records import Integers, Mask, SensorCalibration, Values
     from pipeline.core.settings import DataSheet, Sensor
 
-MOVING = ("soak", "slow")  # kinds of recordings whose readings change slowly by more than noise
+CHANGING_KINDS = ("soak", "slow")  # kinds of recordings whose readings change slowly by more than noise
 CORRELATION_TIME_FACTORS = np.exp2(np.arange(-6.0, 4.0))  # correlation times of the grid, over that of the sensor file
 TIMES_BY_HAND = np.exp2(np.arange(-11.0, 4.0))  # the same by hand: from 0.05 s at 100 s; a tremor has 8 to 12 Hz
 MIN_BLOCK_SAMPLES = 8  # samples of a block
@@ -130,7 +130,7 @@ def _not_below_rounding(noise: Noise, sensor: str, recordings: Sequence[Recordin
 
 def _of_recordings(sensor: str, fitted: list[Recording], data_sheet: DataSheet) -> Noise:
     """Return the noise as it shows in the recordings, else that of the sensor file."""
-    others = [r for r in fitted if NOISE_OF_ROWS not in r.source and r.kind not in MOVING]
+    others = [r for r in fitted if NOISE_OF_ROWS not in r.source and r.kind not in CHANGING_KINDS]
     if fitted and not others:
         return _of_means_or_soaks(sensor, fitted, data_sheet)
     fitted = others
@@ -162,7 +162,7 @@ def _of_recordings(sensor: str, fitted: list[Recording], data_sheet: DataSheet) 
 
 def _of_means_or_soaks(sensor: str, recordings: list[Recording], data_sheet: DataSheet) -> Noise:
     """Return the noise of units with no rests or turns; in soaks and slow movement the fast part is noise."""
-    soaks = [values for r in recordings if r.kind in MOVING and (values := r.reading(sensor)) is not None]
+    soaks = [values for r in recordings if r.kind in CHANGING_KINDS and (values := r.reading(sensor)) is not None]
     if not soaks:
         return _with_stated_wander(np.full(3, recordings[0].source[NOISE_OF_ROWS][sensor]), data_sheet, "data_sheet")
     steps = np.concatenate([np.abs(np.diff(values, axis=0)) for values in soaks])

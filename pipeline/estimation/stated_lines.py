@@ -44,6 +44,7 @@ from pipeline.estimation.uncertainty_budget import (
     clock_contribution,
     with_uncertainty,
 )
+from pipeline.physics.effects.base import OF_THE_BIAS
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.signal.filters import temperature_of
 
@@ -53,7 +54,6 @@ if TYPE_CHECKING:
     from pipeline.core.records import UnitRecordings
     from pipeline.core.settings import DataSheet, Settings, Table
 
-OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic", "bias_temperature_cubic")
 FITTED = {"bias": OF_THE_BIAS, "scale_factor": ("scale_factor_temperature",)}
 BURSTS = "interval of bursts"
 GRAVITY_ON_EARTH = 0.0044  # relative: 9.7639 to 9.8337 m/s^2 (Hirt et al. 2013, GRL 40, 4279) against 9.80665 m/s^2

@@ -9,7 +9,7 @@ Read the sheet of a unit's recordings, ``recordings.csv``: one row a file, which
 | column | content |
 |---|---|
 | ``file`` | name of a file in the folder of the unit |
-| ``kind`` | one of ``KINDS`` |
+| ``kind`` | one of ``FILE_KINDS`` |
 | ``axis`` | of a turn: ``x``, ``-y``, or three numbers; the body axis, as far as it is known |
 | ``angle_deg`` | of a turn, in all, signed by the right hand; empty: whole turns are found from the gyroscope |
 | ``angle_accuracy_deg`` | of a turn, its standard uncertainty; empty: that of the procedure |
@@ -34,7 +34,7 @@ from imu_logs.files import SUFFIXES, read_text
 from pipeline.core.errors import ConfigurationError, IngestError, MissingInputError
 from pipeline.core.files import state_of_files
 from pipeline.core.records import AXES
-from pipeline.core.settings import Kind, RecordingFile
+from pipeline.core.settings import FileKind, RecordingFile
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -120,7 +120,7 @@ def wrong_name(name: str) -> str:
     return f"a name cannot end in {ending}, which marks files of another kind" if ending else ""
 
 
-KINDS: tuple[str, ...] = get_args(Kind)
+FILE_KINDS: tuple[str, ...] = get_args(FileKind)
 COLUMNS = ("file", "kind", "axis", "angle_deg", "angle_accuracy_deg", "held_out", "label")
 SHEET = "recordings"  # its name among recordings that are named one by one
 OF_TURNS = ("axis", "angle_deg", "angle_accuracy_deg")
@@ -129,7 +129,7 @@ LARGEST = 1_000_000  # bytes: thousands of rows
 EXAMPLE = f"""\
 {",".join(COLUMNS)}
 # one row a file in this folder; docs/recordings.md has a row for each case. The kinds are
-# {", ".join(k for k in KINDS if k != "table")}
+# {", ".join(k for k in FILE_KINDS if k != "table")}
 # still.csv,rest
 # tx.csv,turn,x,360,1
 # other.csv,turn,x,360,1,yes
@@ -233,7 +233,7 @@ def _entry(row: Mapping[str, str], path: str, line: int) -> RecordingFile:
     ]
     checks = [
         ("file", not row["file"], "the name of a file in this folder"),
-        ("kind", kind not in KINDS, f"one of {', '.join(KINDS)}"),
+        ("kind", kind not in FILE_KINDS, f"one of {', '.join(FILE_KINDS)}"),
         ("kind", kind == "table", "another kind (turns on a table with a log: procedure three_axis_turns)"),
         ("held_out", held_out not in ANSWERS, "yes or nothing"),
         *of_turns,

@@ -283,7 +283,7 @@ def _compare_clocks(recordings: list[Recording]) -> list[Recording]:
 
 LABEL = "label"
 AVERAGED_S = 1.0  # shorter than anyone averages by hand: the noise is then rather too large
-ROW_S = 1.0  # between the rows of a block
+BETWEEN_ROWS_S = 1.0  # between the rows of a block
 
 
 def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, checks: Checks) -> Log:
@@ -291,11 +291,13 @@ def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, che
     if path.suffix.lower() != ".csv" or len(layouts) != 1:
         raise IngestError("attitudes are read from one .csv; export them as text", str(path), code="foreign")
     columns = tuple(c for c in layouts[0].columns if c.channel != TIME)
-    table = read_csv([path], [layouts[0].model_copy(update={"columns": columns, "rate_hz": 1.0 / ROW_S})], checks)
+    table = read_csv(
+        [path], [layouts[0].model_copy(update={"columns": columns, "rate_hz": 1.0 / BETWEEN_ROWS_S})], checks
+    )
     assert table.lines is not None  # noqa: S101  (of text)
     starts = _starts(path, layouts[0], table.lines)
     number = np.cumsum(starts) - 1
-    time = np.arange(len(starts)) * ROW_S + number * BETWEEN_ATTITUDES_S
+    time = np.arange(len(starts)) * BETWEEN_ROWS_S + number * BETWEEN_ATTITUDES_S
     notes = tuple(note for note in table.notes if note.code != "N-SYNTHTIME")
     table = replace(table, time_ns=np.rint(time * 1e9).astype(np.int64), notes=notes)
     if not starts.all():

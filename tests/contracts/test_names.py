@@ -48,13 +48,6 @@ SAME_MEANING = {
 }
 
 
-# Names that still have several meanings.
-NOT_YET = {
-    "COMMANDS", "Error", "FAILED", "INCOMPLETE", "KINDS", "Kind", "LETTERS", "MOVING", "NARROWEST",
-    "LEAST_TURN_DEG", "OF_THE_BIAS", "Problem", "RESTING", "ROW_S", "SHEET", "WHOLE",
-}  # fmt: skip
-
-
 def definitions() -> Iterator[tuple[str, str]]:
     """Yield name and module of each class and constant of a module; an alias of a type is a class."""
     for file in [*ROOT.glob("pipeline/**/*.py"), *ROOT.glob("imu_research/**/*.py")]:
@@ -71,5 +64,5 @@ def test_a_name_of_several_modules_has_one_meaning() -> None:
     for name, module in definitions():
         modules[name].append(module)
     shared = {name: found for name, found in modules.items() if len(found) > 1}
-    assert {name: found for name, found in shared.items() if name not in SAME_MEANING.keys() | NOT_YET} == {}
-    assert (SAME_MEANING.keys() | NOT_YET) - shared.keys() == set()
+    assert {name: found for name, found in shared.items() if name not in SAME_MEANING} == {}
+    assert SAME_MEANING.keys() - shared.keys() == set()

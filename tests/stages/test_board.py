@@ -10,7 +10,7 @@ from stage_files import write_pack
 
 from pipeline.app.steps.batch import Job
 from pipeline.app.steps.calibration import _on_board
-from pipeline.core.pack import FAILED, Pack
+from pipeline.core.pack import FAILED_SUFFIX, Pack
 from pipeline.core.settings import Board
 from pipeline.ingest.arrow import to_parquet
 from pipeline.simulation.description import shipped_settings
@@ -29,7 +29,7 @@ def test_the_reference_of_a_board_says_how_the_others_sit(tmp_path: Path) -> Non
     kept = dict.fromkeys(("accelerometer", "gyroscope"), TESTED)
     files = {
         "ingest": {f"{c.unit}.parquet": to_parquet(c.recordings) for c in chips},
-        "validate": {f"{n}.json": validation_document(n, kept) for n in names} | {f"lost{FAILED}": {}},
+        "validate": {f"{n}.json": validation_document(n, kept) for n in names} | {f"lost{FAILED_SUFFIX}": {}},
     }
     for sensor in ("accelerometer", "gyroscope"):
         files[sensor] = {f"{c.unit}.json": c.calibrations[sensor].to_json() for c in chips}

@@ -13,7 +13,7 @@ import yaml
 
 from pipeline.app.commands import parser_of
 from pipeline.app.config.campaign import find_campaign, read_layers
-from pipeline.app.config.options import GROUPS, Problem, default_option, nearest, parse, read_option
+from pipeline.app.config.options import GROUPS, SettingProblem, default_option, nearest, parse, read_option
 from pipeline.app.config.user_effects import PYTHON
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
@@ -48,7 +48,7 @@ def main(argv: Sequence[str]) -> int:
     layers = all_layers.of(unit)
     try:
         config = composer.unit(unit, [text for _, text in layers])
-    except Problem as problem:
+    except SettingProblem as problem:
         raise ConfigurationError(f"unit {unit}: {problem}", str(directory / "units.csv")) from None
     print(f"# Unit {unit} of campaign {directory}")
     print("\n".join([*_overrides(layers), *_tree(config.configuration, _origins(composer, layers), composer)]))

@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from pipeline.core.verdicts import Problem
 
 MOST_ROWS = 24  # of an overview: those of a terminal
-NARROWEST = 40  # columns, below which lines are not wrapped further
+MIN_TEXT_COLUMNS = 40  # columns, below which lines are not wrapped further
 UPPER_LIMITS = "Upper limits"  # the sentence of ``in_words`` that --limits adds
-COMMANDS = ("python -m pipeline ", "imu-calibration ", "snakemake ")
+COMMAND_STARTS = ("python -m pipeline ", "imu-calibration ", "snakemake ")
 EPILOG = """\
 examples:
   python -m pipeline explain demo                                        what to do, in at most 24 rows
@@ -75,7 +75,7 @@ def main(argv: Sequence[str]) -> int:
         return 0
     of_campaign = not arguments.units and not is_published(file)
     read = arguments.all or not of_campaign
-    width = max(get_terminal_size().columns, NARROWEST)
+    width = max(get_terminal_size().columns, MIN_TEXT_COLUMNS)
     folder, diagnoses, failures = find(arguments.campaign, arguments.units, Path(arguments.results), read=read)
     if not read and not (folder / "summary.csv").is_file():
         _, diagnoses, _ = find(arguments.campaign, arguments.units, Path(arguments.results))
@@ -171,7 +171,7 @@ def _wrapped(lines: Sequence[str], width: int) -> list[str]:
     found = []
     for line in lines:
         indent = line[: len(line) - len(line.lstrip())]
-        if len(line) <= width or line.lstrip().startswith(COMMANDS):
+        if len(line) <= width or line.lstrip().startswith(COMMAND_STARTS):
             found.append(line)
         else:
             found += wrap(line, width, subsequent_indent=f"{indent}  ", break_long_words=False, break_on_hyphens=False)

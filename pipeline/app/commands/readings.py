@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from imu_logs.files import SUFFIXES, ZIP, is_message_log
 from imu_logs.profile import checks_of
 from pipeline.app.config.compose import Composer
-from pipeline.app.config.options import Problem, nearest
+from pipeline.app.config.options import SettingProblem, nearest
 from pipeline.checks.checks import check_recordings
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
@@ -155,7 +155,7 @@ def config_of_log(
             copyfile(path, directory / "configs" / "ingest" / f"{path.stem}.yaml")
         try:
             return Composer(directory).unit("check", [*layers, f"ingest={path.stem}"])
-        except Problem as problem:
+        except SettingProblem as problem:
             raise ConfigurationError(str(problem), profile if directory == Path(folder) else None) from None
 
 

@@ -36,7 +36,7 @@ from pydantic import ValidationError
 from imu_logs.units import SENSORS
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import as_list, load_layers
-from pipeline.app.config.options import GROUPS, RUN_SETTINGS, Problem, mapping_of, nearest, parse
+from pipeline.app.config.options import GROUPS, RUN_SETTINGS, SettingProblem, mapping_of, nearest, parse
 from pipeline.app.config.stage_settings import last_stage
 from pipeline.app.config.user_effects import PYTHON
 from pipeline.core.errors import ConfigurationError, shortened
@@ -148,7 +148,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
             texts = [text for _, text in layers.of(name)]
             overrides = {text.partition("=")[0].strip(): text.partition("=")[2].strip() for text in texts}
             units[name] = UnitRow(name, row, composer.unit(name, texts), overrides)
-        except Problem as problem:
+        except SettingProblem as problem:
             for line in str(problem).splitlines():
                 problems.setdefault(line, []).append(name)
     if problems:
@@ -202,7 +202,7 @@ def run_settings(overrides: Sequence[str]) -> RunSettings:
     try:
         settings |= dict(map(parse, overrides))
         return RunSettings.model_validate(settings)
-    except Problem as problem:
+    except SettingProblem as problem:
         raise ConfigurationError(str(problem)) from problem
     except ValidationError as error:
         name = str(error.errors()[0]["loc"][0])
@@ -275,7 +275,7 @@ def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], fi
     for number, entry in enumerate(entries, 1):
         try:
             comparisons.append(_comparison(entry, number, rows))
-        except Problem as problem:
+        except SettingProblem as problem:
             title = entry.get("title") if isinstance(entry, dict) else None
             problems.append(f"compare, {f'{title!r}' if title else f'entry {number}'}: {problem}")
     if problems:
@@ -285,7 +285,7 @@ def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], fi
 
 def _cell(rows: SheetRows, unit: str, column: str) -> str:
     if column not in rows[unit]:
-        raise Problem(f"units have no column {column!r}{nearest(column, rows[unit])}")
+        raise SettingProblem(f"units have no column {column!r}{nearest(column, rows[unit])}")
     return str(rows[unit][column])
 
 
@@ -296,28 +296,28 @@ def _select(rows: SheetRows, wanted: Any, among: Sequence[str]) -> list[str]:  #
         return [u for u in among if all(_cell(rows, u, column) in valid for column, valid in values.items())]
     if not isinstance(wanted, list):
         form = "columns and their values, for example {method: staged}"
-        raise Problem(f"a list of units is expected, or {form}, got {wanted!r}")
+        raise SettingProblem(f"a list of units is expected, or {form}, got {wanted!r}")
     for name in map(str, wanted):
         if name not in rows:
-            raise Problem(f"no unit {name!r} in units.csv{nearest(name, rows)}")
+            raise SettingProblem(f"no unit {name!r} in units.csv{nearest(name, rows)}")
     return [str(n) for n in wanted]
 
 
 def _comparison(entry: Any, number: int, rows: SheetRows) -> JSON:  # noqa: ANN401  (the user's)
     entry = {"units": entry} if isinstance(entry, list) else entry
     if not isinstance(entry, dict):
-        raise Problem(f"{COMPARISON_FORM} is expected, got {entry!r}")
+        raise SettingProblem(f"{COMPARISON_FORM} is expected, got {entry!r}")
     unknown = [str(k) for k in entry if k not in COMPARISON_KEYS]
     if unknown:
-        raise Problem(f"{unknown[0]}: unknown key{nearest(unknown[0], COMPARISON_KEYS)}")
+        raise SettingProblem(f"{unknown[0]}: unknown key{nearest(unknown[0], COMPARISON_KEYS)}")
     groups = _groups(entry, rows)
     names, members = [g["name"] for g in groups], [u for g in groups for u in g["units"]]
     against = str(entry.get("against", names[0]))
     if against not in names:
-        raise Problem(f"against: no group is called {against!r}{nearest(against, names)}")
+        raise SettingProblem(f"against: no group is called {against!r}{nearest(against, names)}")
     sensors, pairs = _names(entry.get("sensors", list(SENSORS))), entry.get("pairs")
     if not set(sensors) <= set(SENSORS):
-        raise Problem(f"sensors: {' and '.join(SENSORS)} are known, got {', '.join(sensors)}")
+        raise SettingProblem(f"sensors: {' and '.join(SENSORS)} are known, got {', '.join(sensors)}")
     return {
         "title": str(entry.get("title") or f"Comparison {number}"),
         "groups": groups,
@@ -332,7 +332,7 @@ def _groups(entry: JSON, rows: SheetRows) -> list[JSON]:
     """Return the groups of an entry: at least two, none empty, without common units."""
     keys = [k for k in ("units", "groups", "by") if k in entry]
     if len(keys) != 1:
-        raise Problem(f"{COMPARISON_FORM} is expected, got {' and '.join(keys) or 'none of them'}")
+        raise SettingProblem(f"{COMPARISON_FORM} is expected, got {' and '.join(keys) or 'none of them'}")
     among, content = _select(rows, entry.get("where") or {}, list(rows)), entry[keys[0]]
     if keys[0] == "by":
         groups = _by(_names(content), str(entry.get("x", "")), among, rows)
@@ -340,19 +340,19 @@ def _groups(entry: JSON, rows: SheetRows) -> list[JSON]:
         if keys[0] == "units":
             content = {unit: [unit] for unit in _select(rows, content, among)}
         if not isinstance(content, dict):
-            raise Problem(f"groups: a mapping of names to units or columns is expected, got {content!r}")
+            raise SettingProblem(f"groups: a mapping of names to units or columns is expected, got {content!r}")
         units_of = {str(name): _select(rows, wanted, among) for name, wanted in content.items()}
         groups = [{"name": name, "series": "", "label": name, "units": units} for name, units in units_of.items()]
     group_of: dict[str, str] = {}
     for group in groups:
         if not group["units"]:
-            raise Problem(f"group {group['name']!r} is empty: no unit has these values")
+            raise SettingProblem(f"group {group['name']!r} is empty: no unit has these values")
         for unit in group["units"]:
             if unit in group_of:
-                raise Problem(f"unit {unit} is in {group_of[unit]!r} and in {group['name']!r}; it can be in one")
+                raise SettingProblem(f"unit {unit} is in {group_of[unit]!r} and in {group['name']!r}; it can be in one")
             group_of[unit] = group["name"]
     if len(groups) < 2:
-        raise Problem(f"two groups or more are expected, got {len(groups)}")
+        raise SettingProblem(f"two groups or more are expected, got {len(groups)}")
     return groups
 
 
@@ -381,7 +381,7 @@ def _x(column: str, members: list[str], by: list[str], rows: SheetRows) -> JSON:
         except ValueError:
             values[unit] = math.nan
         if not math.isfinite(values[unit]):
-            raise Problem(f"x: unit {unit} has {text!r} in column {column!r}, which is no number")
+            raise SettingProblem(f"x: unit {unit} has {text!r} in column {column!r}, which is no number")
     return {"label": column, "values": values, "named": column not in by}
 
 

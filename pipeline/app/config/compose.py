@@ -27,7 +27,7 @@ from imu_logs.units import SENSORS
 from pipeline.app.config.options import (
     GROUPS,
     RUN_SETTINGS,
-    Problem,
+    SettingProblem,
     default_option,
     mapping_of,
     nearest,
@@ -101,7 +101,7 @@ class Composer:
     def unit(self, name: str, layers: Sequence[str]) -> Settings:
         """Return the checked settings of a unit from its overrides, weakest first.
 
-        Raises ``Problem`` with one line for each error.
+        Raises ``SettingProblem`` with one line for each error.
         """
         groups, values = self.split(layers)
         key = repr((sorted(groups.items()), values))
@@ -116,30 +116,32 @@ class Composer:
         return with_given(unit, self.below) if GIVEN in (unit.method.accelerometer, unit.method.gyroscope) else unit
 
     def split(self, layers: Sequence[str]) -> tuple[dict[str, str], list[tuple[str, Any]]]:
-        """Split overrides into the chosen options by group, and the values in their order; raises ``Problem``."""
+        """Split overrides into the chosen options by group, and the values in order; raises ``SettingProblem``."""
         groups: dict[str, str] = {}
         values: list[tuple[str, Any]] = []
         for text in layers:
             key, value = parse(text)
             if key in GROUPS and isinstance(value, str):
                 if value not in self.options[key]:
-                    raise Problem(f"{key}={value}: no such {key}{nearest(value, self.options[key])}")
+                    raise SettingProblem(f"{key}={value}: no such {key}{nearest(value, self.options[key])}")
                 groups[key] = value
             elif key in RUN_SETTINGS:
-                raise Problem(
+                raise SettingProblem(
                     f"{text}: {key} is a setting of the run, not of a unit; set it in campaign.yaml or overrides="
                 )
             elif key == PYTHON:
-                raise Problem(f"{text}: {ONLY_FROM_THE_COMMAND_LINE}")
+                raise SettingProblem(f"{text}: {ONLY_FROM_THE_COMMAND_LINE}")
             elif key.startswith("method.stages"):
-                raise Problem(f"{text}: stages are what a method is; write a method of your own in configs/method/")
+                raise SettingProblem(
+                    f"{text}: stages are what a method is; write a method of your own in configs/method/"
+                )
             else:
                 values.append((key, value))
         sensor = self._read("sensor", groups.get("sensor") or default_option("sensor"))
         try:
             return groups, [setting for key, value in values for setting in range_settings(key, value, sensor)]
         except ConfigurationError as error:
-            raise Problem(error.message) from None
+            raise SettingProblem(error.message) from None
 
     def _resolve(self, groups: dict[str, str], values: list[tuple[str, Any]]) -> Settings:
         base, has_references = self._base(self.complete(groups))
@@ -149,12 +151,12 @@ class Composer:
         merged["sensor"] = without_overridden(merged["sensor"], {key for key, _ in values})
         if merged["ingest"].get("instance") is not None and INSTANCE not in repr(merged["ingest"]):
             profile = merged["ingest"]["name"]
-            raise Problem(f"ingest.instance is set, and no name in the profile {profile} contains {INSTANCE}")
+            raise SettingProblem(f"ingest.instance is set, and no name in the profile {profile} contains {INSTANCE}")
         if has_references or "${" in repr(values):
             try:
                 merged = with_references(merged, merged)
             except ConfigurationError as error:
-                raise Problem(error.message) from error
+                raise SettingProblem(error.message) from error
         checked: dict[str, Any] = {}
         errors: list[Any] = []
         for section, content in merged.items():
@@ -163,7 +165,7 @@ class Composer:
             except ValidationError as error:
                 errors += [{**e, "loc": (section, *e["loc"])} for e in error.errors()]
         if errors:
-            raise Problem("\n".join(_explain(e, merged) for e in errors))
+            raise SettingProblem("\n".join(_explain(e, merged) for e in errors))
         checked["method"] = _with_known(self._with_stages(checked["method"]), checked["sensor"])
         checked["procedure"] = _with_unused_optional(checked["procedure"], checked["method"])
         settings = Settings.model_construct(unit="", user_effects=self.user_effects.section(), **checked)
@@ -214,25 +216,29 @@ class Composer:
         """Return the method with the stages of the method that is chosen for each sensor."""
         stages: dict[str, list[str]] = {}
         if method.accelerometer is None and method.gyroscope is None:
-            raise Problem("method.accelerometer and method.gyroscope are both null: no sensor would be calibrated")
+            raise SettingProblem(
+                "method.accelerometer and method.gyroscope are both null: no sensor would be calibrated"
+            )
         for sensor in SENSORS:
             name = method.of(sensor)
             if name is None:
                 stages[sensor] = [NOT_WANTED]
                 continue
             if name not in self.options["method"]:
-                raise Problem(f"method.{sensor}={name}: no such method{nearest(name, self.options['method'])}")
+                raise SettingProblem(f"method.{sensor}={name}: no such method{nearest(name, self.options['method'])}")
             of_method = method.stages.of(sensor) if name == method.name else self._stages(name).get(sensor)
             if not of_method:
                 valid = [m for m in self.options["method"] if self._stages(m).get(sensor)]
-                raise Problem(f"method.{sensor}={name}: {name} has no stages for the {sensor}{nearest(name, valid)}")
+                raise SettingProblem(
+                    f"method.{sensor}={name}: {name} has no stages for the {sensor}{nearest(name, valid)}"
+                )
             stages[sensor] = list(of_method)
             try:
                 check_stages(sensor, stages[sensor])
             except ConfigurationError as error:
-                raise Problem(f"method.{sensor}={name}: {error.message} (configs/method/{name}.yaml)") from None
+                raise SettingProblem(f"method.{sensor}={name}: {error.message} (configs/method/{name}.yaml)") from None
             if not any({"bias", "matrix"} & {*declared(sensor, stage).changes} for stage in stages[sensor]):
-                raise Problem(
+                raise SettingProblem(
                     f"method.{sensor}={name}: no stage fits bias or matrix: add one that does, such as "
                     f"reference_least_squares (configs/method/{name}.yaml)"
                 )
@@ -249,24 +255,24 @@ class Composer:
             known = {entry.setup for entry in procedure.recordings.values() if entry.setup is not None}
             if setup not in known:
                 hint = nearest(setup, known) if known else "; name the setup of each recording in the procedure config"
-                raise Problem(f"{whole}: no recording of procedure {procedure.name} has setup: {setup}{hint}")
+                raise SettingProblem(f"{whole}: no recording of procedure {procedure.name} has setup: {setup}{hint}")
             if name in OF_A_SETUP:
                 return
         if name not in self.effects:
-            raise Problem(f"effects.{sensor}: no effect is called {name!r}{nearest(name, self.effects)}")
+            raise SettingProblem(f"effects.{sensor}: no effect is called {name!r}{nearest(name, self.effects)}")
         user_effect = self.user_effects.effects.get(name)
         if user_effect and separator:
-            raise Problem(f"effects.{sensor}: {whole}: an effect that you define cannot apply to one setup only")
+            raise SettingProblem(f"effects.{sensor}: {whole}: an effect that you define cannot apply to one setup only")
         applies = user_effect.sensors if user_effect else read_option("effect", name, ()).get("sensors", [sensor])
         if sensor not in applies:
-            raise Problem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
+            raise SettingProblem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
 
     def _check_limits(self, sensor: str, limits: Iterable[str]) -> None:
         """Refuse a limit that is neither of an effect nor of its parameter, such as ``warm_up_time_constant``."""
         for name in limits:
             if name not in self.effects and not any(name.startswith(f"{effect}_") for effect in self.effects):
                 hint = nearest(name, self.effects)
-                raise Problem(f"sensor.{sensor}.effects.{name}: no effect is called {name!r}{hint}")
+                raise SettingProblem(f"sensor.{sensor}.effects.{name}: no effect is called {name!r}{hint}")
 
     def _check_meaning(self, settings: Settings) -> None:
         stated = {key for key in OF_BENCH if getattr(settings.table, key)}
@@ -280,22 +286,24 @@ class Composer:
                 user_effect = self.user_effects.effects.get(name)
                 contains = user_effect.contains if user_effect else read_option("effect", name, ()).get("contains", [])
                 if within := [other for other in names if other in contains]:
-                    raise Problem(f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them")
+                    raise SettingProblem(
+                        f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them"
+                    )
         ingest = repr((settings.ingest, settings.procedure))
         if ingest not in self._valid_ingest:
             try:
                 check_ingest(settings.ingest, settings.procedure)
             except ConfigurationError as error:
-                raise Problem(error.message) from error
+                raise SettingProblem(error.message) from error
             self._valid_ingest.add(ingest)
         for sensor in SENSORS if settings.filter.name in WITHOUT_CONSTANT else ():
             if any(declared(sensor, stage).known for stage in settings.method.stages.of(sensor) or ()):
-                raise Problem(
+                raise SettingProblem(
                     f"filter={settings.filter.name} removes the slow changes of a bias, and method.{sensor}="
                     f"{settings.method.of(sensor)} subtracts them: choose another filter or another method"
                 )
         if (settings.table.latitude_deg is None) != (settings.table.azimuth_deg is None):
-            raise Problem(
+            raise SettingProblem(
                 "table.latitude_deg and table.azimuth_deg: set both (Earth's rotation is modelled) or neither (null)"
             )
 
@@ -305,7 +313,7 @@ def _composed(groups: Groups, folders: Sequence[Path], *_: object) -> dict[Any, 
     """Return what Hydra composes from a choice of groups, with options from the folders of a campaign.
 
     The other arguments are those that change with the files in these folders. A choice of shipped options is kept in
-    the user's cache. Raises ``Problem``.
+    the user's cache. Raises ``SettingProblem``.
     """
     if folders:
         return _compose(groups, folders)
@@ -338,20 +346,20 @@ def _compose(groups: Groups, folders: Sequence[Path]) -> dict[Any, Any]:
             return dict(composed)
     except (HydraException, OmegaConfBaseException) as error:
         cause = f" ({error.__cause__})" if error.__cause__ else ""
-        raise Problem(f"{str(error).splitlines()[0]}{cause}") from error
+        raise SettingProblem(f"{str(error).splitlines()[0]}{cause}") from error
     finally:
         GlobalHydra.instance().hydra = before
 
 
 def _with_known(method: Method, sensors: Sensor) -> Method:
-    """Return the method with the known effects of its stages (``known``) by sensor; raises ``Problem``."""
+    """Return the method with the known effects of its stages (``known``) by sensor; raises ``SettingProblem``."""
     known = {}
     for sensor in SENSORS:
         declarations = [declared(sensor, stage) for stage in method.stages.of(sensor) or ()]
         try:
             effects = [e for stage in declarations if stage.known for e in stage.known(sensor, sensors.of(sensor))]
         except ConfigurationError as error:
-            raise Problem(f"method.{sensor}={method.of(sensor)}: {error.message}") from None
+            raise SettingProblem(f"method.{sensor}={method.of(sensor)}: {error.message}") from None
         if effects:
             known[sensor] = [{"name": e.name, "parameters": e.parameters} for e in effects]
     return method.replaced(known=known) if known else method
@@ -375,7 +383,7 @@ def _set(tree: dict[str, Any], path: list[str], value: Any) -> None:  # noqa: AN
     for i, key in enumerate(path[:-1]):
         node = tree.get(key, {})
         if not isinstance(node, dict):
-            raise Problem(f"{'.'.join(path)}: {'.'.join(path[: i + 1])} is a value ({node!r}), it has no keys")
+            raise SettingProblem(f"{'.'.join(path)}: {'.'.join(path[: i + 1])} is a value ({node!r}), it has no keys")
         tree[key] = dict(node)
         tree = tree[key]
     tree[path[-1]] = value

@@ -33,7 +33,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from imu_logs.files import not_regular, read_text
 from imu_logs.yaml_file import read_yaml
-from pipeline.app.config.options import GROUPS, RUN_SETTINGS, Problem, default_option, nearest, parse
+from pipeline.app.config.options import GROUPS, RUN_SETTINGS, SettingProblem, default_option, nearest, parse
 from pipeline.app.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.core.errors import ConfigurationError, shortened
 from pipeline.ingest.files import wrong_name
@@ -323,7 +323,7 @@ def _check_models_and_lots(campaign: CampaignFile, units_table: UnitsTable, sens
                 raise ConfigurationError(f"{key}, {name}: {run[0]} is a setting of the run, not of units", file)
             try:
                 chooses_model = key == "models" and any(parse(o)[0] == "sensor" for o in overrides)
-            except Problem as problem:
+            except SettingProblem as problem:
                 raise ConfigurationError(str(problem)) from problem
             if chooses_model:
                 raise ConfigurationError(f"models, {name}: the overrides of a model cannot choose another", file)

@@ -35,7 +35,7 @@ MAX_REFERENCE_LENGTH = 10_000  # characters of a value with references, such as 
 REFERENCE_FORM = "a reference is ${group.key}, for example ${sensor.accelerometer.counts_per_unit}"
 
 
-class Problem(Exception):  # noqa: N818  (problems are collected, then raised as one ConfigurationError)
+class SettingProblem(Exception):  # noqa: N818  (problems are collected, then raised as one ConfigurationError)
     """One error in a configuration."""
 
 
@@ -52,7 +52,7 @@ def parse(text: str) -> tuple[str, Any]:
     """Parse one Hydra override to its key and value.
 
     A plain number, word or path, the usual override of a single unit, is read without Hydra's parser, which takes
-    0.6 ms, and 0.1 s at first. Raises ``Problem`` if the text is not an override, or is a sweep or a deletion.
+    0.6 ms, and 0.1 s at first. Raises ``SettingProblem`` if the text is not an override, or is a sweep or a deletion.
     """
     number, words = NUMBER_OVERRIDE.fullmatch(text), WORD_OVERRIDE.fullmatch(text)
     if number:
@@ -64,13 +64,15 @@ def parse(text: str) -> tuple[str, Any]:
 
     hint = "; write KEY=VALUE, for example filter.cutoff_hz=5"
     if text.startswith("["):
-        raise Problem(f'{text!r} is not a list of overrides; quote each one: \'overrides=["a=1","b=[x,y]"]\'')
+        raise SettingProblem(f'{text!r} is not a list of overrides; quote each one: \'overrides=["a=1","b=[x,y]"]\'')
     try:
         override = _hydras_parser().parse_override(text)
     except (OverrideParseException, HydraException) as error:
-        raise Problem(f"{text!r} is not a Hydra override ({str(error).splitlines()[0]}){hint}") from error
+        raise SettingProblem(f"{text!r} is not a Hydra override ({str(error).splitlines()[0]}){hint}") from error
     if override.is_sweep_override() or override.is_delete():
-        raise Problem(f"{text!r} is a {'sweep' if override.is_sweep_override() else 'deletion'}; give one value{hint}")
+        raise SettingProblem(
+            f"{text!r} is a {'sweep' if override.is_sweep_override() else 'deletion'}; give one value{hint}"
+        )
     return override.key_or_group, override.value()
 
 

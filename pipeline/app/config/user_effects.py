@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from imu_logs.files import read_text
 from imu_logs.units import SENSORS
 from imu_logs.yaml_file import MAX_YAML_BYTES
-from pipeline.app.config.options import Problem
+from pipeline.app.config.options import SettingProblem
 from pipeline.core.errors import ConfigurationError, PipelineError
 from pipeline.core.files import CONFIGS
 from pipeline.core.settings import OF_BENCH, UserEffectFiles
@@ -139,7 +139,7 @@ def with_given(settings: Settings, campaign: Path) -> Settings:
 
     ``method.given``: ``source`` (for texts), ``sha256``, ``notes``, and bias, matrix, effects and uncertainties of each
     sensor as in ``calibrations/<unit>.json``. ``effects``: the effects of the file that the sensor causes. Raises
-    ``Problem``.
+    ``SettingProblem``.
     """
     from pipeline.output.exports.reading import read_any  # noqa: PLC0415  (only for this method)
     from pipeline.physics.effects import owner_of  # noqa: PLC0415  (as above)
@@ -147,21 +147,25 @@ def with_given(settings: Settings, campaign: Path) -> Settings:
 
     method, effects = settings.method, {sensor: settings.effects.of(sensor) for sensor in SENSORS}
     if not method.file:
-        raise Problem("method=given: method.file is not set; name the calibration, in any format of docs/apply.md")
+        raise SettingProblem(
+            "method=given: method.file is not set; name the calibration, in any format of docs/apply.md"
+        )
     if stated := [f"table.{key}" for key in OF_BENCH if getattr(settings.table, key)]:
-        raise Problem(f"method=given: {stated[0]} is set, which a fit would estimate; nothing is fitted: set it null")
+        raise SettingProblem(
+            f"method=given: {stated[0]} is set, which a fit would estimate; nothing is fitted: set it null"
+        )
     file = campaign / method.file.replace("{unit}", settings.unit)
     try:
         content = read_any(file, method.format, {s: settings.sensor.of(s).counts_per_unit for s in SENSORS})
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
     except PipelineError as error:
-        raise Problem(f"method.file: {error}") from error
+        raise SettingProblem(f"method.file: {error}") from error
     given: dict[str, Any] = {"source": f"{file.name} ({content.format_name})", "sha256": digest, "notes": content.notes}
     for sensor in SENSORS:
         if method.of(sensor) != GIVEN:
             continue
         if effects[sensor]:
-            raise Problem(
+            raise SettingProblem(
                 f"effects.{sensor}: method=given takes the effects from its file; to fit effects, choose another method"
             )
         calibration = content.sensors.get(sensor)

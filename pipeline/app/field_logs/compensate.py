@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 BLOCK_BYTES = 1 << 21  # of a text log: 20,000 rows, whose arrays take about 10 MB
 DESCRIPTOR = re.compile(r"-|/dev/stdout|(?:/dev/fd|/proc/self/fd)/(\d+)")  # files that are already open
-KINDS = {".mcap": "MCAP", ".csv": "text", ".txt": "text"}
+LOG_FORMATS = {".mcap": "MCAP", ".csv": "text", ".txt": "text"}
 
 
 def compensate_log(
@@ -126,7 +126,7 @@ def require_apart(source: Path, target: Path) -> None:
         raise InputError("the output would overwrite the log; choose another file for -o", str(target))
     if not target.resolve().parent.is_dir():
         raise InputError("the directory of the output does not exist; make it first", str(target))
-    kinds = [KINDS.get(file.suffix.lower(), "text" if file is source else None) for file in (source, target)]
+    kinds = [LOG_FORMATS.get(file.suffix.lower(), "text" if file is source else None) for file in (source, target)]
     if kinds[1] is not None and kinds[0] != kinds[1]:
         is_text = source.suffix.lower() in MESSAGE_FORMATS
         log = f"of a {source.suffix} log text is made" if is_text else f"the log is {kinds[0]}, and so is the output"

@@ -370,10 +370,10 @@ def _numbers(value: Any, path: str) -> Iterator[str]:  # noqa: ANN401  (a messag
         yield from _numbers(child, f"{path}.{name}" if path else name)
 
 
-RESTING = 0.8  # share of a recording that lies still
+RESTING_SHARE = 0.8  # share of a recording that lies still
 SAME_ATTITUDE_DEG = 5.0
 SWEPT_DEGC = 10.0  # as of a sweep that validation shows
-LEAST_TURN_DEG = 45.0
+MIN_PROPOSED_TURN_DEG = 45.0
 WHOLE, ROUND_DEG = 0.05, 1.0  # relative: a scale factor error of 3 %, and a hand; of an angle that is proposed
 SMOOTHED_S = 0.2
 CLEARER = 0.25  # of the sum of squares, below which another map of axes is proposed
@@ -420,7 +420,7 @@ def _is_still(recording: Recording) -> bool:
     rests = _accepted(recording)
     u = [recording.accelerometer[r.start : r.stop].mean(axis=0) for r in rests]
     apart = [np.degrees(np.linalg.norm(v / np.linalg.norm(v) - u[0] / np.linalg.norm(u[0]))) for v in u]
-    return sum(r.stop - r.start for r in rests) > RESTING * recording.samples and max(apart) < SAME_ATTITUDE_DEG
+    return sum(r.stop - r.start for r in rests) > RESTING_SHARE * recording.samples and max(apart) < SAME_ATTITUDE_DEG
 
 
 def _row(recording: Recording, bias: Values) -> str:
@@ -436,7 +436,7 @@ def _row(recording: Recording, bias: Values) -> str:
         axis = int(np.argmax(np.abs(angle)))
         size, across = abs(float(angle[axis])), float(np.linalg.norm(np.delete(angle, axis)))
         turned = np.abs(np.trapezoid(np.linalg.norm(rate - own, axis=1), recording.time))
-        if size > LEAST_TURN_DEG and across < MAX_AXIS_SINE * size and turned < 2.0 * size:
+        if size > MIN_PROPOSED_TURN_DEG and across < MAX_AXIS_SINE * size and turned < 2.0 * size:
             name = f"{'-' if angle[axis] < 0.0 else ''}{AXES[axis]}"
             whole = 360.0 * round(size / 360.0)
             stated = "" if whole and abs(size - whole) < WHOLE * whole else f"{ROUND_DEG * round(size / ROUND_DEG):g}"

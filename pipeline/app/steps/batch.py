@@ -25,7 +25,7 @@ from pipeline.app.results_folder import hold_as_job, record_written, repetitions
 from pipeline.app.steps import MODULES
 from pipeline.core.errors import DamagedFileError, PipelineError, failure_of, is_of_run, omission
 from pipeline.core.files import read_json, write_json
-from pipeline.core.pack import FAILED, INCOMPLETE, Files, Pack, as_bytes, new_pack
+from pipeline.core.pack import FAILED_SUFFIX, INCOMPLETE_SUFFIX, Files, Pack, as_bytes, new_pack
 from pipeline.core.settings import Settings, UserEffectFiles
 from pipeline.unit import EFFECTS_STAGE, STEPS, Task, run_step
 
@@ -121,7 +121,7 @@ def main(stage: str, argv: Sequence[str]) -> int:
             else:
                 files = _files_of(module, job, unit, settings)
             add(files)
-            if inputs and not {unit + FAILED, unit + INCOMPLETE} & files.keys():
+            if inputs and not {unit + FAILED_SUFFIX, unit + INCOMPLETE_SUFFIX} & files.keys():
                 add({unit + INPUTS_OF: as_bytes({"sha256": inputs, "files": [*files]})})
     _link_output(job.output)
     record_output(job, job.output)
@@ -234,7 +234,7 @@ def _below(job: Job, output: Path) -> str:
 
 def _files_of(module: ModuleType, job: Job, unit: str, settings: Settings) -> dict[str, bytes]:
     """Return the files of a unit; for a unit that failed here or before, with the record of its failure."""
-    name = unit + FAILED
+    name = unit + FAILED_SUFFIX
     stage = "/".join([job.stage, *(str(job.run[k]) for k in ("sensor", "stage") if job.run.get(k))])
     try:
         earlier = next((pack for pack in job.inputs.values() if name in pack), None)
@@ -260,7 +260,7 @@ def _made_or_replaced(module: ModuleType, job: Job, unit: str, settings: Setting
         record = omission(error, unit, stage)
         without = getattr(module, f"{job.stage}_without", None)
         instead = without(job, unit, settings, record) if without else {}
-        return _encoded({**instead, unit + INCOMPLETE: [record]})
+        return _encoded({**instead, unit + INCOMPLETE_SUFFIX: [record]})
 
 
 def _made(module: ModuleType, job: Job, unit: str, settings: Settings) -> Files:

@@ -27,7 +27,7 @@ import numpy as np
 
 from pipeline.app.steps.unit_files import StoredUnit
 from pipeline.core.errors import CannotCalibrateError, NotObservableError, PipelineError
-from pipeline.core.pack import FAILED
+from pipeline.core.pack import FAILED_SUFFIX
 from pipeline.core.records import (
     AXES,
     SCHEMA_VERSION,
@@ -179,7 +179,7 @@ def _on_board(job: Job, unit: str, board: Board) -> dict[str, Any]:
     chips: dict[str, Any] = {}
     for other in others if unit == reference else ():
         try:
-            if f"{other}{FAILED}" in job.inputs["validate"]:
+            if f"{other}{FAILED_SUFFIX}" in job.inputs["validate"]:
                 raise NotObservableError(f"{other} could not be calibrated")
             chips[other] = chip_document(_chip(job, reference), _chip(job, other))
         except PipelineError as error:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from imu_logs.files import unchanged
 from pipeline.checks.checks import check_recordings
 from pipeline.core.errors import IngestError, PipelineError, failure_of
-from pipeline.core.pack import FAILED, Pack, as_bytes, new_pack
+from pipeline.core.pack import FAILED_SUFFIX, Pack, as_bytes, new_pack
 from pipeline.ingest.files import candidate_files, recording_files, state_of_recordings
 from pipeline.ingest.read import read_recordings
 from pipeline.physics.signal.segments import cut, held_out_windows, logged_turns
@@ -44,7 +44,7 @@ def collect_batch(job: Job) -> None:
                             add({_member(path): path.read_bytes()})
                         done.add(_member(path))
             except IngestError as error:
-                add({unit + FAILED: as_bytes(failure_of(error, unit, "ingest"))})
+                add({unit + FAILED_SUFFIX: as_bytes(failure_of(error, unit, "ingest"))})
             # Empty members, because ingest reports missing folders, and files that it did not read.
             files |= {f"{_member(folders[unit])}/": b""} if folders[unit].is_dir() else {}
             files |= {_member(path): b"" for path in _candidates(settings, folders[unit]) if path.exists()}

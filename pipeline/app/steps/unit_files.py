@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.core.pack import INCOMPLETE, Pack
+from pipeline.core.pack import INCOMPLETE_SUFFIX, Pack
 from pipeline.core.records import SENSORS, Noise, UnitRecordings, Validation, fit_from_json
 from pipeline.ingest.arrow import from_parquet, to_parquet
 from pipeline.unit import UnitFiles
@@ -82,7 +82,7 @@ class StoredUnit:
     @cached_property
     def omissions(self) -> list[dict[str, Any]]:
         """Records of what the stages diagnose and export could not make."""
-        name, packs = self.unit + INCOMPLETE, (self.job.inputs[stage] for stage in ("diagnose", "export"))
+        name, packs = self.unit + INCOMPLETE_SUFFIX, (self.job.inputs[stage] for stage in ("diagnose", "export"))
         return [record for pack in packs if name in pack for record in pack.json(name)]
 
     @cached_property
@@ -108,7 +108,7 @@ FILES: dict[str, Callable[[str, Any], Files]] = {
     "diagnose": lambda unit, found: (
         {f"{unit}.json": found.document}
         | found.effect_files
-        | ({unit + INCOMPLETE: found.omissions} if found.omissions else {})
+        | ({unit + INCOMPLETE_SUFFIX: found.omissions} if found.omissions else {})
     ),
     "calibration": lambda unit, document: {f"{unit}.json": document},
     "export": lambda unit, files: {f"{unit}/{file}": text for file, text in files.items()},

@@ -31,7 +31,7 @@ from pipeline.estimation.noise_terms import allan_variance
 from pipeline.ingest.axis_maps import STRAIGHT, maps_of_log
 from pipeline.physics.calibration_file import MIN_EXPORTED_TIME_S, sentences
 from pipeline.physics.effects import owner_of
-from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
+from pipeline.physics.effects.base import OF_THE_BIAS, REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -168,7 +168,6 @@ def _rms(values: Sequence[Any]) -> Any:  # noqa: ANN401  (numbers, or lists of t
     return np.sqrt(np.mean(np.square(values), axis=0)).tolist()
 
 
-OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic", "bias_temperature_cubic")
 TEMPERATURES = [-40.0, 85.0]  # degC, the widest specified range of such parts
 ORDER = 4  # coefficients of a polynomial of third order in the temperature
 

@@ -187,7 +187,7 @@ def overview_chart(sensor: str, rows: Sequence[JSON | RowState]) -> UnitChart | 
 
 
 def _shortened(name: str) -> str:
-    return name if len(name) <= LETTERS else f"{name[: LETTERS - 8]}…{name[-7:]}"
+    return name if len(name) <= NAME_LETTERS else f"{name[: NAME_LETTERS - 8]}…{name[-7:]}"
 
 
 def _scale(sensor: str, states: Sequence[RowState]) -> Scale:
@@ -303,7 +303,7 @@ MAX_DRAWN_SHARE = 3.0  # largest share that is drawn: one unit in a wrong unit o
 # siblings below which there is no plot, and above which only the farthest are drawn
 FEWEST_SIBLINGS, MAX_PLOTTED_UNITS = 3, 60
 ENDS = 20  # farthest units of each parameter that are then drawn, on either side
-ROW, LEFT, LETTERS, NAME_LETTER = 17, 130, 22, 7.2  # px; letters of a unit's name, px of each
+ROW, LEFT, NAME_LETTERS, NAME_LETTER = 17, 130, 22, 7.2  # px; letters of a unit's name, px of each
 NAMED_ROWS, HISTOGRAM_BINS = 40, 40  # most units with a row of their own; bins of the histogram of more units
 # of a row: range over which the units are distributed in their order; half height of a bar
 ROW_SPREAD, HALF_BAR = 0.6, 0.42

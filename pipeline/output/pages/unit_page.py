@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 LEFT, LANE, LETTERS = 86, 17, 13  # px of the names, px of a lane, letters of a name
 USES = {"used": 1, "held out": 2, "left out": 0}  # of the rests that a fit found in the readings, with their colours
 LOGGED = 4  # colour of rests from a table's log
-NARROWEST = 0.002  # of the axis: the smallest width of a rest
+MIN_REST_WIDTH = 0.002  # of the axis: the smallest width of a rest
 MOST_REASONS = 3  # sentences that are shown without unfolding
 KINDS_OF_ERROR = ("vector", "magnitude")
 ANGLE_STEP_S = 0.2  # over which a rate is computed from an angle: an encoder of 0.01 deg gives it to 0.05 deg/s
@@ -323,7 +323,7 @@ def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibrat
     one_file = len({r.source.get("file") for r in drawn}) == 1 < len(drawn)
     first = min(float(r.time[0]) for r in drawn)
     begin = {r.name: float(r.time[0]) - first if one_file else 0.0 for r in drawn}
-    narrowest = NARROWEST * max(begin[r.name] + _duration(r) for r in drawn)
+    narrowest = MIN_REST_WIDTH * max(begin[r.name] + _duration(r) for r in drawn)
     lanes = drawn[::-1]  # the first at the top
     layers: list[ChartLayer] = []
     for y, r in enumerate(lanes, 1):

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 REFERENCE_TEMPERATURE = 25.0  # degC, that of data sheets
 STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3
+OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic", "bias_temperature_cubic")  # effects
 OF_THE_ROOM = {"time", "temperature"}  # fields of a motion that do not depend on the readings
 MIN_PROGRAM_STEP_DEG = 5e-3  # above an encoder's resolution (1e-3 deg), below a step of a program (0.1 deg)
 MIN_TURNING_DPS = 0.25  # above a gyroscope's noise and residual bias, below a slow turn of a table (1 deg/s)
