@@ -10,9 +10,9 @@ Read the sheet of a unit's recordings, ``recordings.csv``: one row a file, which
 |---|---|
 | ``file`` | name of a file in the folder of the unit |
 | ``kind`` | one of ``FILE_KINDS`` |
-| ``axis`` | of a turn: ``x``, ``-y``, or three numbers; the body axis, as far as it is known |
+| ``axis`` | of a turn, or of turns on a table: ``x``, ``-y``, or three numbers; the body axis, as far as it is known |
 | ``angle_deg`` | of a turn, in all, signed by the right hand; empty: whole turns are found from the gyroscope |
-| ``angle_accuracy_deg`` | of a turn, its standard uncertainty; empty: that of the procedure |
+| ``angle_accuracy_deg`` | its standard uncertainty; empty: that of the procedure, or of the table |
 | ``held_out`` | ``yes``: no fit and no selection uses the file |
 | ``label`` | any text |
 
@@ -129,7 +129,7 @@ LARGEST = 1_000_000  # bytes: thousands of rows
 EXAMPLE = f"""\
 {",".join(COLUMNS)}
 # one row a file in this folder; docs/recordings.md has a row for each case. The kinds are
-# {", ".join(k for k in FILE_KINDS if k != "table")}
+# {", ".join(FILE_KINDS)}
 # still.csv,rest
 # tx.csv,turn,x,360,1
 # other.csv,turn,x,360,1,yes
@@ -226,17 +226,18 @@ def _rows(text: str, path: str) -> Iterator[tuple[int, dict[str, str]]]:
 def _entry(row: Mapping[str, str], path: str, line: int) -> RecordingFile:
     """Return the recording of a row."""
     kind, held_out, direction = row["kind"], row["held_out"].lower(), direction_of(row["axis"])
-    turned = kind == "turn"
+    turned = kind in {"turn", "table"}
     angle, accuracy = (_number(row[name]) for name in OF_TURNS[1:])
     of_turns = [
         (name, bool(row[name]) and not turned, f"nothing (it is of a turn, this is {kind})") for name in OF_TURNS
     ]
+    logged = kind == "table" and bool(row["angle_deg"])
     checks = [
         ("file", not row["file"], "the name of a file in this folder"),
         ("kind", kind not in FILE_KINDS, f"one of {', '.join(FILE_KINDS)}"),
-        ("kind", kind == "table", "another kind (turns on a table with a log: procedure three_axis_turns)"),
         ("held_out", held_out not in ANSWERS, "yes or nothing"),
         *of_turns,
+        ("angle_deg", logged, "nothing (the table logs it)"),
         ("axis", turned and direction is None, "a body axis, such as x or -y, or three numbers separated by blanks,"),
         ("angle_deg", angle is not None and not 0.0 < abs(angle) < math.inf, "the whole angle, not 0, or nothing,"),
         ("angle_accuracy_deg", accuracy is not None and not 0.0 < accuracy < math.inf, "a number above 0, or nothing,"),

@@ -37,14 +37,14 @@ from pipeline.core.records import AXES, Index, Mask, Motion, Recording, SensorCa
 from pipeline.estimation.multi_position.model import EquationBlock, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import padded, sound_span, spans_between, tangents, trapezoids
 from pipeline.estimation.rest_means import ROLE, Rests
-from pipeline.physics.signal.segments import MAX_AXIS_SINE, SCALE, multiples
+from pipeline.physics.signal.segments import AXIS_ACCURACY, LOGGED_TURNS, MAX_AXIS_SINE, SCALE, multiples
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.core.records import Index, Recording, Values
     from pipeline.core.settings import FacesByHand as StatedFaces
-    from pipeline.core.settings import Procedure
+    from pipeline.core.settings import HandTurns, Procedure, RecordingFile
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.rest_means import Rests
 
@@ -60,6 +60,7 @@ class StatedTurn(NamedTuple):
     direction: Values
     angle: float
     error: float
+    axis_error: float  # deg, standard uncertainty of each angle between the stated axis and the mean turn about it
 
 
 def name_of_axis(direction: Values) -> str:
@@ -110,49 +111,77 @@ def _multiples(
             axis, count = multiples(angle, turns.angle_deg)
             moves.append((recording, float(recording.time[span.start]), angle))
             if count:
-                chosen.append(StatedTurn(index, span, np.eye(3)[axis], count * turns.angle_deg, turns.accuracy_deg))
+                stated = count * turns.angle_deg, turns.accuracy_deg, turns.axis_accuracy_deg
+                chosen.append(StatedTurn(index, span, np.eye(3)[axis], *stated))
     return chosen, moves
 
 
 def _of_sheet(
     recordings: Sequence[Recording], rests: Rests, bias: Values, procedure: Procedure, role: str
 ) -> list[StatedTurn]:
-    """Return the turns that the sheet states, one a recording; those without an angle are by whole turns.
+    """Return the turns that the sheet states, or a table logged; those without an angle are by whole turns.
 
     Raises ``NotObservableError`` if the gyroscope shows another axis, sense or angle, with those that would agree.
     """
-    turns, chosen = procedure.turns, []
-    assert turns is not None  # noqa: S101
+    chosen: list[StatedTurn] = []
+    assert procedure.turns is not None  # noqa: S101
     for index, recording in enumerate(recordings):
         entry = procedure.recordings.get(recording.name)
         if entry is None or entry.direction is None or recording.role != role or recording.gyroscope is None:
             continue
         own = rests.recording == index
         local = np.average(rests.reading[own], axis=0, weights=rests.count[own]) if own.any() else bias
-        span = _moving(recording, rests.span[own], local)
-        if not sound_span(recording, span, longest=np.inf):
-            raise NotObservableError(
-                f"recording {recording.name}: the turn cannot be integrated, as readings of the gyroscope are missing, "
-                "clipped or stuck: record it again, slower or with a larger range",
-                recording.source.get("file"),
-            )
-        direction, angle = np.array(entry.direction), _integral(recording, span, local)
-        along = float(angle @ direction)
-        stated = entry.angle_deg or turns.angle_deg * round(along / turns.angle_deg)
-        across = float(np.linalg.norm(angle - along * direction))
-        if abs(along - stated) >= SCALE * abs(stated) or across >= MAX_AXIS_SINE * abs(along):
-            axis = int(np.argmax(np.abs(angle)))
-            nearest = turns.angle_deg * round(float(angle[axis]) / turns.angle_deg) or float(np.round(angle[axis]))
-            agrees = np.copysign(entry.angle_deg, angle[axis]) if entry.angle_deg else nearest
-            by = f"by {entry.angle_deg:g} deg" if entry.angle_deg else f"by whole turns of {turns.angle_deg:g} deg"
-            raise NotObservableError(
-                f"recording {recording.name} is no turn about {name_of_axis(direction)} {by}: the gyroscope shows "
-                f"{_in_words(angle)}. Correct the sheet (axis {AXES[axis]} and angle_deg {agrees:g} would agree); or, "
-                "if the unit turned as stated, sensor.gyroscope.axis_map or the gyroscope's range",
-                recording.source.get("file"),
-            )
-        chosen.append(StatedTurn(index, span, direction, stated, entry.angle_accuracy_deg or turns.accuracy_deg))
+        direction, logged = np.array(entry.direction), recording.source.get(LOGGED_TURNS)
+        if logged is None:
+            span = _moving(recording, rests.span[own], local)
+            chosen.append(_of_row(recording, index, span, local, entry, procedure.turns))
+            continue
+        for start, stop, stated, error in logged:
+            span = slice(int(start), int(stop))
+            if sound_span(recording, span, longest=np.inf):
+                _require_turned(recording, _integral(recording, span, local), direction, stated, "as the table logged")
+                axis_error = float(recording.source[AXIS_ACCURACY])
+                chosen.append(StatedTurn(index, span, direction, stated, error, axis_error))
     return chosen
+
+
+def _of_row(  # noqa: PLR0917  (what a row states)
+    recording: Recording, index: int, span: slice, bias: Values, entry: RecordingFile, turns: HandTurns
+) -> StatedTurn:
+    """Return the turn that a row of the sheet states."""
+    if not sound_span(recording, span, longest=np.inf):
+        raise NotObservableError(
+            f"recording {recording.name}: the turn cannot be integrated, as readings of the gyroscope are missing, "
+            "clipped or stuck: record it again, slower or with a larger range",
+            recording.source.get("file"),
+        )
+    direction, angle = np.array(entry.direction), _integral(recording, span, bias)
+    stated = entry.angle_deg or turns.angle_deg * round(float(angle @ direction) / turns.angle_deg)
+    by = f"by {entry.angle_deg:g} deg" if entry.angle_deg else f"by whole turns of {turns.angle_deg:g} deg"
+    axis = int(np.argmax(np.abs(angle)))
+    nearest = turns.angle_deg * round(float(angle[axis]) / turns.angle_deg) or float(np.round(angle[axis]))
+    agrees = np.copysign(entry.angle_deg, angle[axis]) if entry.angle_deg else nearest
+    _require_turned(recording, angle, direction, stated, by, f" and angle_deg {agrees:g}")
+    error = entry.angle_accuracy_deg or turns.accuracy_deg
+    return StatedTurn(index, span, direction, stated, error, turns.axis_accuracy_deg)
+
+
+def _require_turned(  # noqa: PLR0917  (what a turn is)
+    recording: Recording, angle: Values, direction: Values, stated: float, by: str, agrees: str = ""
+) -> None:
+    """Raise ``NotObservableError`` if the integrated readings, deg, are no turn by the stated angle."""
+    along = float(angle @ direction)
+    across = float(np.linalg.norm(angle - along * direction))
+    if abs(along - stated) >= SCALE * abs(stated) or across >= MAX_AXIS_SINE * abs(along):
+        axis = int(np.argmax(np.abs(angle)))
+        opposed = "-" if not agrees and stated * angle[axis] < 0.0 else ""
+        would = f"axis {opposed}{AXES[axis]}{agrees}"
+        raise NotObservableError(
+            f"recording {recording.name} is no turn about {name_of_axis(direction)} {by}: the gyroscope shows "
+            f"{_in_words(angle)}. Correct the sheet ({would} would agree); or, if the unit turned as stated, "
+            "sensor.gyroscope.axis_map or the gyroscope's range",
+            recording.source.get("file"),
+        )
 
 
 def _moving(recording: Recording, spans: Index, bias: Values) -> slice:
