@@ -175,7 +175,7 @@ def find_columns(log: UnknownLog) -> Columns:
     _find_time(columns, words)
     times = columns.of_time()
     for sensor in (*TRIADS, "?"):
-        named = {i: w for i, w in words.items() if i not in times and _sensor_of(w) == sensor}
+        named = {i: w for i, w in words.items() if i not in times and sensor_of(w) == sensor}
         triad = _triad(named)
         if triad is not None:
             columns.triads[sensor] = triad
@@ -234,7 +234,7 @@ def _axis_of(words: list[str]) -> str:
     return next((w for w in reversed(words) if w in AXIS_WORDS), "")
 
 
-def _sensor_of(words: list[str]) -> str:
+def sensor_of(words: list[str]) -> str:
     """Return the sensor that a name states, empty for none, ``?`` if the name is only an axis."""
     axis = _axis_of(words)
     if not axis or set(words) & NO_SENSOR:
@@ -423,6 +423,7 @@ def find_layout(data: bytes, path: str) -> UnknownLog:
     tried = [_try(lines[:LINES_TRIED], separator, decimal) for separator in SEPARATORS for decimal in NUMBER]
     width, start, separator, decimal = max(tried, key=lambda t: (t[0], -t[1]))
     names, skip, comment, by_index = _names(lines, start, separator)
+    start = start if by_index or comment else skip + 1
     rate_hz, rate_line = _stated_rate(lines[:start])
     if start == 0 and (e4_rate := _rate_of_empatica(lines, separator)) is not None:
         rate_hz, rate_line, start, skip = e4_rate, lines[1].strip(), 2, 2
@@ -433,7 +434,10 @@ def find_layout(data: bytes, path: str) -> UnknownLog:
     numbers = _numbers(rows, decimal)
     if width < MIN_COLUMNS or len(rows) < MIN_ROWS or not numbers:
         first = " / ".join(lines[:3])[:150]
-        raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, code="no_table")
+        hint = "a row of numbers for each sample is expected, with a separator between them and their names above"
+        raise IngestError(
+            f"no table of numbers was found in it; it starts with {first!r}", path, code="no_table", hint=hint
+        )
     odd = len(parsed) - len(rows) - len(bad)
     skip = start if by_index else skip
     csv_section = {
@@ -521,7 +525,11 @@ def _names(lines: list[str], start: int, separator: str) -> tuple[list[str], int
     if len(names) == width + 1 and not names[-1]:
         names.pop()  # the header does
     if len(names) != width or any(NUMBER["."].fullmatch(name) for name in names):
-        return _numbered(width), start, comment, True
+        rows = enumerate(_cells(lines[:start], separator))  # names may stand above rows with empty cells
+        found = [i for i, row in rows if len(row) == width and not any(NUMBER["."].fullmatch(c) or not c for c in row)]
+        if not found:
+            return _numbered(width), start, comment, True
+        return [c.strip() for c in _cells(lines[found[0] : found[0] + 1], separator)[0]], found[0], None, False
     by_index = not names[0] or len(names) - names.count("") > len({*names} - {""})
     for cells in _cells(lines[max(start - 1 - MOST_ROWS_OF_NAMES, 0) : start - 1][::-1], separator):
         if not by_index or len({*names}) == width or len(cells) != width or not all(cells[1:]):

@@ -20,9 +20,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from imu_logs.clocks import find_bursts
-from imu_logs.columns import TEMPERATURE_RANGE, Columns, find_columns, find_layout, stated_unit, whole, words_of
+from imu_logs.columns import (
+    TEMPERATURE_RANGE,
+    Columns,
+    find_columns,
+    find_layout,
+    sensor_of,
+    stated_unit,
+    whole,
+    words_of,
+)
 from imu_logs.errors import IngestError
-from imu_logs.files import ZIP, is_message_log, member, refuse_foreign, text_members
+from imu_logs.files import ZIP, is_message_log, member, refuse_foreign, text_members, unchanged
 from imu_logs.guesses import (
     CENTIDEGREES,
     OF_SENSOR,
@@ -47,8 +56,10 @@ if TYPE_CHECKING:
 
 UNITS_OF = {"accelerometer": ("g", "mg", "ug", "m/s^2", "mm/s^2"), "gyroscope": ("deg/s", "mdps", "rad/s", "mrad/s")}
 LEAST_GRAVITY = 0.3  # of gravity, for the median |a| of a log; quality_flags refuses less
+MOST_NAMED = 6  # columns in a remark
 FEWEST_LABELS, MOST_LABELS = 3, 4  # two texts may be states of the logger; labels that a remark names
 SAME_UNIT = 0.2  # relative: a low-cost sensor in few positions, and moves by hand
+CLOCK = re.compile(r"\b(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
 SEARCHED_BYTES = 1 << 25  # of a text log, for its layout
 # Topics of autopilots (PX4 uORB, ArduPilot log messages) to the shipped profiles.
 SHIPPED = {
@@ -124,6 +135,11 @@ def layouts_of(path: Path) -> list[UnknownLog]:
 
     Raises ``IngestError`` for a file without a table of numbers.
     """
+    with unchanged(path):
+        return _layouts_of(path)
+
+
+def _layouts_of(path: Path) -> list[UnknownLog]:
     if is_message_log(path):
         from imu_logs.message_read import topics_of  # noqa: PLC0415  (only where it is needed)
 
@@ -238,7 +254,7 @@ def _proposal(parts: list[Columns], evidence: Evidence) -> Proposal:
     for columns, entries in zip(parts, proposal.columns, strict=True):
         _others(columns, entries, proposal, evidence.sensor)
         proposal.remarks += columns.remarks
-        proposal.remarks += columns.log.remarks + _labels(columns.log)
+        proposal.remarks += columns.log.remarks + _labels(columns.log) + _other_forms(columns)
     if shipped := SHIPPED.get((first.topic or "").partition("[")[0]):
         proposal.remarks.append(f"the profile {shipped} is shipped and reads such logs: name it instead")
     if force is not None or rate is not None:
@@ -252,6 +268,18 @@ def _proposal(parts: list[Columns], evidence: Evidence) -> Proposal:
                 f'counts_per_unit: "{OF_SENSOR.format(name)}"; leave the three lines out if it is not in the log'
             )
     return proposal
+
+
+def _other_forms(columns: Columns) -> list[str]:
+    """Return remarks on readings that a log holds in another form: as a sum, or in rows of several kinds."""
+    log, remarks = columns.log, list[str]()
+    if "accelerometer" not in columns.triads and {"user", "gravity"} <= {w for n in log.names for w in words_of(n)}:
+        remarks.append("the specific force is the sum of gravity and user acceleration: add its three columns")
+    partly = [log.names[i] for i in log.texts if sensor_of(words_of(log.names[i])) not in ("", "?")]
+    if partly and not columns.triads:
+        named = ", ".join(partly[:MOST_NAMED])
+        remarks.append(f"{named} hold no number in some rows: write a file for each kind of row")
+    return remarks
 
 
 def _labels(log: UnknownLog) -> list[str]:
@@ -301,8 +329,21 @@ def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
     if first.csv["rate_hz"] is not None:
         return np.arange(len(next(iter(first.numbers.values())))) / float(first.csv["rate_hz"])
     proposal.csv["rate_hz"] = TO_DECIDE
-    proposal.evidence["rate_hz"] = "there is no time: the sampling rate in Hz"
+    proposal.evidence["rate_hz"] = f"there is no time: the sampling rate in Hz{_rate_by_a_text(first)}"
     return None
+
+
+def _rate_by_a_text(log: UnknownLog) -> str:
+    """Return the mean rate by a column of times of day, which are no numbers; empty for none."""
+    for index, texts in log.texts.items():
+        matches = [CLOCK.search(text) for text in (texts[0], texts[-1])]
+        first, last = (sum(float(n) * s for n, s in zip(m.groups(), (3600, 60, 1), strict=True)) if m else 0.0
+                       for m in matches)  # fmt: skip
+        if last > first and all(matches):
+            rate = (len(texts) - 1) / (last - first)
+            name, span = log.names[index], f"{len(texts)} rows in {last - first:.5g} s"
+            return f"; {name} is no number: {span}, {rate:.4g} Hz on average"
+    return ""
 
 
 def _regular(time_s: Values, parts: list[Columns]) -> Values:

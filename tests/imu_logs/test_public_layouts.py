@@ -163,6 +163,10 @@ def test_a_name_in_whole_mg_is_not_doubted(tmp_path: Path) -> None:
         ("log.BIN", b"\x02@\x10\x08@" + bytes(range(200)), "no DataFlash log"),
         ("log.dat", bytes(range(1, 250)) * 700 + bytes(5000), "a binary file of a kind that is not known"),
         ("log.npy", b"", "Python objects"),
+        ("log.cwa", b"MD\xfc\x03" + bytes(range(200)), "Axivity"),
+        ("log.bin", b"Device Identity\r\nDevice Type:GENEActiv\r\n" * 9, "GENEActiv"),
+        ("log.txt", b'{"sensor": "accelerometer", "x": "-0.85"}\n' * 9, "JSON"),
+        ("log.mcap", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "git lfs pull"),
     ],
 )
 def test_other_kinds_are_named(tmp_path: Path, name: str, content: bytes, words: str) -> None:
@@ -192,3 +196,25 @@ def test_times_in_ms_of_an_old_dataflash_log(tmp_path: Path) -> None:
         proposal.columns[0][f"gyro_{axis}"]["unit"] = "rad/s"
     assert proposal.columns[0]["time"] == {"column": "TimeMS", "unit": "ms"}
     assert_reads(tmp_path / "log.bin", proposal)
+
+
+def test_names_above_rows_with_empty_cells(tmp_path: Path) -> None:
+    """As loggers write that give each message a row of one table."""
+    readings = "".join(f"{i},,,,\n" + 2 * f"{i},{x:.4f},{y:.4f},{z:.4f},\n" for i, (x, y, z) in enumerate(FORCE))
+    proposal = proposed(tmp_path / "log.csv", f"Index,Accel X,Accel Y,Accel Z,Baro\n0,,,,\n{readings}")
+    assert any("Accel X, Accel Y, Accel Z hold no number in some rows" in remark for remark in proposal.remarks)
+
+
+def test_times_of_day_tell_the_mean_rate(tmp_path: Path) -> None:
+    """As WitMotion exports: the rate stays open, with what decides it."""
+    clock = [f"08:58:{6 + t:09.6f}" for t in TIME]
+    proposal = proposed(tmp_path / "log.txt", f"Time(s)\tax(g)\tay(g)\taz(g)\n{rows(clock, FORCE, separator=chr(9))}")
+    assert "100 Hz on average" in proposal.evidence["rate_hz"]
+    assert_reads(tmp_path / "log.txt", proposal, rate_hz=100.0)
+
+
+def test_gravity_and_user_acceleration_are_to_be_added(tmp_path: Path) -> None:
+    names = ",".join(f"{what}.{a}" for what in ("gravity", "userAcceleration", "rotationRate") for a in "xyz")
+    proposal = proposed(tmp_path / "log.csv", f"t_ms,{names}\n{rows(1000.0 * TIME, FORCE, 0.01 * RATE, RATE)}")
+    assert "gyro_x" in proposal.columns[0]
+    assert any("sum of gravity and user acceleration" in remark for remark in proposal.remarks)
