@@ -206,7 +206,7 @@ def _find_forces_in_g(columns: Columns) -> None:
     """Take xg, yg, zg as a specific force in g if they have its size."""
     triad, names = columns.triads.get("gyroscope"), columns.log.names
     named = triad is not None and len(columns.triads) == 1 and all(IN_G.fullmatch(names[i]) for i in triad)
-    if triad and named and _is_gravity(columns.log, triad):
+    if triad and named and is_gravity(columns.log, triad):
         columns.triads = {"accelerometer": triad}
 
 
@@ -352,7 +352,7 @@ def _spread(log: UnknownLog, triad: Triad, offset: float) -> float:
     return float((high - low) / max(middle, 1e-30))
 
 
-def _is_gravity(log: UnknownLog, triad: Triad) -> bool:
+def is_gravity(log: UnknownLog, triad: Triad) -> bool:
     """Return whether the length of vectors is gravity in g or m/s^2, or about it; a pressure in hPa would be mg."""
     size = float(np.median(np.linalg.norm([log.numbers[i] for i in triad], axis=0)))
     near = any(abs(size / FORCE_UNITS[unit] - 1.0) < LOW_COST_ERROR for unit in ("g", "m/s^2"))
@@ -379,7 +379,7 @@ def _find_triads_without_names(columns: Columns) -> None:
         columns.remarks.append(f"no names: {called(groups[0])} are taken as the {sensor}'s x, y, z; check it")
     elif groups:
         offset = _offset(log, groups)
-        of_gravity = [group for group in groups if _is_gravity(log, group)]
+        of_gravity = [group for group in groups if is_gravity(log, group)]
         force = min(of_gravity or groups, key=lambda group: _spread(log, group, offset))
         rate = next(group for group in groups if group != force)
         if not of_gravity and _spread(log, force, offset) > LARGEST_SPREAD:

@@ -28,6 +28,7 @@ ASSUMED_HZ = 100.0  # if the time is unknown
 TOO_FAST_FOR_RADIANS = 40.0  # rad/s, 2300 deg/s: beyond the range of usual sensors
 BURST_INTERVAL_DIFFERENCE = 0.1  # relative difference of mean and median interval, from which both are stated
 LARGEST_LINEAR = 5.0  # in m/s^2, of a walk
+LONGEST_MEAN_S = 1.0  # mean interval of a slow log with a date
 RATES_HZ = (5.0, 20_000.0)  # sampling rates of inertial sensors
 CENTIDEGREES = "cdeg"  # in the name of a table's angle
 TURN_OF = {"deg": 360.0, "rad": 2.0 * np.pi}  # a turn in units of angle
@@ -62,6 +63,9 @@ def time_unit(values: Values, stated: str | None, why: str) -> Guess:
     suits = [u for u, s in seconds.items() if step and low <= 1 / (step * s) <= high and mean * s * high >= 1]
     dated = [u for u, s in seconds.items() if step and SINCE_1970_S[0] < float(values[0]) * s < SINCE_1970_S[1]]
     since = [u for u in dated if u in suits or not suits]
+    if not since and (slow := [u for u in dated if mean * seconds[u] <= LONGEST_MEAN_S]):
+        evidence = f"steps of {step:.6g} suit {suits[0]} since power-on, and {slow[0]} since 1970 at"
+        return Guess({"unit": TO_DECIDE}, f"{evidence} {1 / (mean * seconds[slow[0]]):.4g} Hz on average")
     for unit in since or suits:
         others = [f", or {u} at {1 / (step * seconds[u]):.4g} Hz" for u in suits if u != unit and not since]
         what = "since 1970, in " if since else ""
@@ -132,8 +136,7 @@ def force_by_size(size: float, where: str) -> Guess:
     for unit, gravity in FORCE_UNITS.items():
         if abs(size / gravity - 1) < LOW_COST_ERROR:
             return Guess({"unit": unit}, f"{where}, so {unit}")
-    no_gravity = "; without gravity (linear acceleration) a log calibrates nothing" * (size < LARGEST_LINEAR)
-    return Guess({"unit": TO_DECIDE}, f"{where}, which is neither 1 (g), 9.8 (m/s^2) nor 1000 (mg){no_gravity}")
+    return Guess({"unit": TO_DECIDE}, f"{where}, which is neither 1 (g), 9.8 (m/s^2) nor 1000 (mg)")
 
 
 def rate_by_size(largest: float, otherwise: str, *, guessed: bool) -> Guess:

@@ -25,6 +25,7 @@ from imu_logs.columns import (
     Columns,
     find_columns,
     find_layout,
+    is_gravity,
     sensor_of,
     stated_unit,
     whole,
@@ -34,6 +35,7 @@ from imu_logs.errors import IngestError
 from imu_logs.files import ZIP, is_message_log, member, refuse_foreign, text_members, unchanged
 from imu_logs.guesses import (
     CENTIDEGREES,
+    LARGEST_LINEAR,
     OF_SENSOR,
     TO_DECIDE,
     Guess,
@@ -93,12 +95,15 @@ class Proposal:
     @property
     def complete(self) -> bool:
         """Whether it has a sensor and no value to fill in."""
-        channels = {c for entries in self.columns for c in entries}
-        return any(set(t) <= channels for t in TRIADS.values()) and not self.unknown()
+        return bool(self.sensors()) and not self.unknown()
 
     def text(self, name: str = "my_logger") -> str:
         """Return the YAML of the profile, with the evidence for each line."""
         return as_yaml(self, name)
+
+    def sensors(self) -> set[str]:
+        """Return the sensors whose three axes it has."""
+        return {s for s, triad in TRIADS.items() if set(triad) <= {c for entries in self.columns for c in entries}}
 
     def unknown(self) -> list[str]:
         """Return the keys and channels with a value to fill in."""
@@ -167,7 +172,7 @@ def _table_in(archive: Path, file: Path) -> list[UnknownLog]:
 def propose(logs: Sequence[UnknownLog], evidence: Evidence) -> list[Proposal]:
     """Return a proposal for each layout among the logs; ``evidence`` decides the units that names do not state."""
     recordings: list[list[Columns]] = []  # each of one file, or of two files with equal times and one sensor each
-    for columns in map(find_columns, logs):
+    for columns in sorted(map(find_columns, logs), key=_is_linear):  # a gyroscope belongs to the file with gravity
         other = next((parts for parts in recordings if len(parts) == 1 and _belong_together(parts[0], columns)), None)
         if other is None:
             recordings.append([columns])
@@ -184,6 +189,14 @@ def propose(logs: Sequence[UnknownLog], evidence: Evidence) -> list[Proposal]:
     return proposals
 
 
+def _is_linear(columns: Columns) -> bool:
+    """Return whether the accelerometer's readings, which are no counts, are smaller than gravity in each unit."""
+    triad = columns.triads.get("accelerometer")
+    if triad is None or whole(np.array([columns.log.numbers[i] for i in triad])):
+        return False
+    return not is_gravity(columns.log, triad)
+
+
 def _belong_together(one: Columns, two: Columns) -> bool:
     if len(one.triads) != 1 or len(two.triads) != 1 or set(one.triads) == set(two.triads):
         return False
@@ -194,7 +207,7 @@ def _belong_together(one: Columns, two: Columns) -> bool:
 
 def _alike(one: Proposal, two: Proposal) -> bool:
     """Return whether one profile can read both: equal names, or different names only for optional channels."""
-    if one.parts or two.parts:
+    if one.parts or two.parts or one.sensors() != two.sensors():
         return False
     if [log.names for log in one.logs] == [log.names for log in two.logs] and one.csv == two.csv:
         return True
@@ -407,7 +420,8 @@ def _add(sensor: str, parts: list[Columns], proposal: Proposal, guess: Guess) ->
     units = {unit for unit, _ in said if unit}
     if len(units) == 1:  # of one axis alone: wx(rad/s), wy, wz
         said = [next(entry for entry in said if entry[0])] * len(said)
-    if sensor == "accelerometer" and (without := _without_gravity(log, triad, said[0][0])):
+    unit = said[0][0] or guess.entry["unit"]
+    if sensor == "accelerometer" and (without := _without_gravity(log, triad, unit)):
         proposal.remarks.append(without)
     for channel, index, (stated, why) in zip(TRIADS[sensor], triad, said, strict=True):
         entry = {"unit": stated} if stated in UNITS_OF[sensor] else guess.entry
@@ -426,14 +440,15 @@ def _contradicts(entry: Mapping[str, Any], channel: str, stated: str) -> bool:
     return isinstance(counts, float) and abs(counts * multiplier / divisor - 1.0) > SAME_UNIT
 
 
-def _without_gravity(log: UnknownLog, triad: tuple[int, int, int], unit: str | None) -> str:
+def _without_gravity(log: UnknownLog, triad: tuple[int, int, int], unit: str) -> str:
     """Return a remark if the accelerometer reads far less than gravity; empty for none."""
     size = float(np.median(np.linalg.norm([log.numbers[i] for i in triad], axis=0)))
-    if unit not in FORCE_UNITS or size > LEAST_GRAVITY * FORCE_UNITS[unit]:
+    if size > LEAST_GRAVITY * FORCE_UNITS.get(unit, 0.0) and not (unit == TO_DECIDE and size < LARGEST_LINEAR):
         return ""
     return (
-        f"|a| is {size:.3g} {unit} on the whole: acceleration without gravity, which calibrates nothing; take the "
-        "columns or the file with gravity (TotalAcceleration beside Accelerometer, Acc beside FreeAcc)"
+        f"|a| is {size:.3g} {unit.removeprefix(TO_DECIDE)} on the whole: acceleration without gravity, which "
+        "calibrates nothing; take the columns or the file with gravity (TotalAcceleration beside Accelerometer, Acc "
+        "beside FreeAcc)"
     )
 
 

@@ -70,7 +70,8 @@ CANONICAL = {
 
 # Spellings of units in the names of columns, lower case and without blanks, to the names used here.
 SPELLINGS = {
-    "mm/s^2": "mm/s^2", "mm/s2": "mm/s^2",
+    "mm/s^2": "mm/s^2", "mm/s2": "mm/s^2", "g's": "g", "rad/sec": "rad/s", "radian/s": "rad/s", "radians/s": "rad/s",
+    "deg/sec": "deg/s", "degree/s": "deg/s", "degrees/s": "deg/s", "degrees/sec": "deg/s",
     "g": "g", "mg": "mg", "m/s^2": "m/s^2", "m/s2": "m/s^2", "m/s²": "m/s^2", "ms^-2": "m/s^2", "m/s/s": "m/s^2",
     "mps2": "m/s^2", "deg/s": "deg/s", "°/s": "deg/s", "dps": "deg/s", "degs/s": "deg/s", "rad/s": "rad/s",
     "rads/s": "rad/s", "s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us", "μs": "us", "ns": "ns",
@@ -83,7 +84,7 @@ BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 
 def unit_spelt(text: str) -> str | None:
     """Return the unit that a text spells; None for any other text."""
-    return SPELLINGS.get(text.strip().lower().replace(" ", ""))
+    return SPELLINGS.get(text.strip().lower().removeprefix("in ").replace(" ", ""))
 
 
 def unit_in_brackets(name: str) -> str | None:

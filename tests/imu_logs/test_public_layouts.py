@@ -218,3 +218,29 @@ def test_gravity_and_user_acceleration_are_to_be_added(tmp_path: Path) -> None:
     proposal = proposed(tmp_path / "log.csv", f"t_ms,{names}\n{rows(1000.0 * TIME, FORCE, 0.01 * RATE, RATE)}")
     assert "gyro_x" in proposal.columns[0]
     assert any("sum of gravity and user acceleration" in remark for remark in proposal.remarks)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_files_of_one_layout_hold_several_sensors(tmp_path: Path, order: int) -> None:
+    """As Sensor Logger exports: a gyroscope belongs to the file with gravity, never to the columns of another file."""
+    linear = 9.80665 * (FORCE - [0.0, 0.0, 1.0])
+    contents = {"Accelerometer": linear, "Gyroscope": RATE, "TotalAcceleration": 9.80665 * FORCE}
+    for name, values in contents.items():
+        (tmp_path / f"{name}.csv").write_text(f"time,seconds_elapsed,z,y,x\n{rows(TIME, TIME, values[:, ::-1])}")
+    paths = [tmp_path / f"{name}.csv" for name in [*contents][::order]]
+    pair, other = imu_logs.propose(paths)
+    assert sorted(pair.parts) == ["Gyroscope.csv", "TotalAcceleration.csv"]
+    assert any("without gravity" in remark for remark in other.remarks)
+    assert other.columns[0]["accel_x"]["unit"] == "???"
+
+
+def test_units_in_words(tmp_path: Path) -> None:
+    names = "timestamp,ax (in G's),ay (in G's),az (in G's)" + "".join(f",g{a} (in radians/s)" for a in "xyz")
+    assert_reads(tmp_path / "log.csv", proposed(tmp_path / "log.csv", f"{names}\n{rows(TIME, FORCE, RATE)}"))
+
+
+def test_a_time_that_may_be_a_date_is_left_open(tmp_path: Path) -> None:
+    batches = 1_723_696_180_000 + 380 * (np.arange(ROWS) // 2)
+    proposal = proposed(tmp_path / "accelerometer.csv", rows(batches, 9.8 * FORCE))
+    assert proposal.columns[0]["time"]["unit"] == "???"
+    assert "ms since 1970" in proposal.evidence["time"]
