@@ -114,9 +114,9 @@ def is_binary(data: bytes) -> bool:
 
 
 def is_message_log(path: Path) -> bool:
-    """Return whether a file is a log of messages or arrays, by its suffix; a text with ``.mat`` or ``.bin`` is none."""
+    """Return whether a file is a log of messages or arrays, by its suffix; a text with such a suffix is none."""
     suffix = path.suffix.lower()
-    if suffix in (".mat", ".bin") and path.is_file():
+    if suffix in MESSAGE_FORMATS and path.is_file():
         with path.open("rb") as stream:
             start = stream.read(PRINTABLE)
         return (

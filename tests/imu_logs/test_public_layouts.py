@@ -244,3 +244,9 @@ def test_a_time_that_may_be_a_date_is_left_open(tmp_path: Path) -> None:
     proposal = proposed(tmp_path / "accelerometer.csv", rows(batches, 9.8 * FORCE))
     assert proposal.columns[0]["time"]["unit"] == "???"
     assert "ms since 1970" in proposal.evidence["time"]
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".bin", ".h5"])
+def test_a_text_with_the_suffix_of_another_format_is_a_text(tmp_path: Path, suffix: str) -> None:
+    file = tmp_path / f"imu_data{suffix}"
+    assert_reads(file, proposed(file, rows(TIME, FORCE, separator=" ")))
