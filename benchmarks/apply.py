@@ -127,12 +127,7 @@ def mcap_unchanged(log: Path, out: Path, _calibration: Path) -> int:
     from mcap.opcode import Opcode  # noqa: PLC0415
     from mcap.records import Chunk  # noqa: PLC0415
 
-    from imu_logs.mcap_file import (  # noqa: PLC0415  (only where it is needed)
-        RECORD_HEAD,
-        McapReader,
-        bytes_of,
-        parsed,
-    )
+    from imu_logs.mcap_file import RECORD_HEAD, McapReader, bytes_of, parsed  # noqa: PLC0415  (only where it is needed)
     from imu_logs.mcap_write import McapCopy  # noqa: PLC0415
 
     with log.open("rb") as stream, out.open("wb") as target:

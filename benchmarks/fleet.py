@@ -108,10 +108,7 @@ def _run(folder: Path, cores: int) -> None:
     """Run the campaign, or the rest of it, and append to ``runs`` what it has used, also where it is interrupted."""
     (folder / "sitecustomize.py").write_text(TELL, encoding="utf-8")
     paths = [str(folder.absolute()), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(paths),
-        "FLEET_TOLD": str((folder / "told").absolute()),
-    }
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "FLEET_TOLD": str((folder / "told").absolute())}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package is not compiled at each start
     command = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", str(cores)]
     if any(folder.glob(".snakemake/locks/*")):  # of a run that was killed

@@ -257,7 +257,7 @@ def _all_at_once(
             "formats": ["<u2", *(p.code if p.count is None else (p.code, p.count) for p in places.values())],
             "offsets": [CHANNEL_AT, *(HEAD.itemsize + p.offset for p in places.values())],
             "itemsize": size,
-        },
+        }
     )
     starts = rows.starts - HEAD.itemsize
     if rows.stride:

@@ -454,7 +454,7 @@ def load_profile(profile: Mapping[str, Any] | str | os.PathLike[str], **changed:
         if not path.is_file():
             known = ", ".join(sorted(f.stem for f in PROFILES.glob("*.yaml")))
             raise ConfigurationError(
-                f"no profile {profile}; shipped are {known}; name one of your own by its YAML file",
+                f"no profile {profile}; shipped are {known}; name one of your own by its YAML file"
             )
         from imu_logs.yaml_file import read_yaml  # noqa: PLC0415  (a run reads profiles as settings)
 

@@ -387,11 +387,7 @@ def in_order(table: Log, rows: TextRows, checks: Checks) -> Log:
         raise over_budget(error, touched, len(time_ns), checks)
     table, notes = table.select(order), []
     for code, places, detail in (
-        (
-            "N-SORT",
-            moved,
-            f"rows out of order were sorted by their times, displaced by {displaced.max()} rows at most",
-        ),
+        ("N-SORT", moved, f"rows out of order were sorted by their times, displaced by {displaced.max()} rows at most"),
         ("N-DUP", twice, "rows that repeat the row before them, including the time, were dropped"),
     ):
         if places.size:

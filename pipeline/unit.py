@@ -159,10 +159,7 @@ def run_steps(state: UnitState, tasks: Iterator[Task], settings_of: Callable[[Ta
 
 
 def run_checked(
-    recordings: Sequence[Recording],
-    stages: Mapping[str, Sequence[str]],
-    settings: Settings,
-    until: str = "fit",
+    recordings: Sequence[Recording], stages: Mapping[str, Sequence[str]], settings: Settings, until: str = "fit"
 ) -> UnitState:
     """Run the steps from ``filter`` to ``until`` on recordings that are checked, or simulated without a fault.
 

@@ -8,7 +8,7 @@ from pipeline.app.config import load_campaign, settings_of_jobs
 from pipeline.app.config.owner import check_owner, claim, complete_record
 from pipeline.app.results_folder import read_owner, release_locks
 from pipeline.app.steps import batch
-from pipeline.ingest.digests import digests_of_files
+from pipeline.ingest.files import digests_of_files
 from pipeline.physics.effects import forget
 
 if TYPE_CHECKING:

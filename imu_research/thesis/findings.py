@@ -192,9 +192,7 @@ def conclusions(rows: pd.DataFrame) -> dict[str, list[FindingLine]]:
     ]
     least_squares = [
         errors.line(
-            f"{name}, {reading}: staged against least squares",
-            (recordings, method),
-            (recordings, "least-squares"),
+            f"{name}, {reading}: staged against least squares", (recordings, method), (recordings, "least-squares")
         )
         for method, reading in EQUATIONS_AS.items()
         for device, name in devices

@@ -98,10 +98,7 @@ def key_of(explanations: Sequence[JSON], cell: JSON) -> str:
 
 
 PROCEDURES = {"accelerometer": (*STOPS, *CONTINUOUS), "gyroscope": RATES}
-BELOW = {
-    "accelerometer": "stop and go, rest in s; continuous, deg/s",
-    "gyroscope": "rate, deg/s",
-}
+BELOW = {"accelerometer": "stop and go, rest in s; continuous, deg/s", "gyroscope": "rate, deg/s"}
 FILTER_NAMES = {
     "staged": "RC low-pass",
     "same-gain": "the same gain without delay",
@@ -217,10 +214,7 @@ def _methods(results: Results, printed_errors: pd.Series[float], sensor: str) ->
 def _tables(results: Results, printed_errors: pd.Series[float]) -> Figure:
     """Draw the error after calibration on both tables, as a share of the error before."""
     groups = {}
-    for sensor, procedure, printed_before in (
-        ("accelerometer", "stop-1s", 0.069),
-        ("gyroscope", "gyro-60dps", 1.724),
-    ):
+    for sensor, procedure, printed_before in (("accelerometer", "stop-1s", 0.069), ("gyroscope", "gyro-60dps", 1.724)):
         before = np.nan_to_num(results.errors(f"mpu6050-1-{procedure}-printed", sensor)[0], nan=1.0)
         short = {"accelerometer": "accel.", "gyroscope": "gyro"}[sensor]
         for table, infix in (("", ""), (", home", "mark2-")):

@@ -180,8 +180,7 @@ class Drawn:
         unit = self.turns_set.unit
         shipped = shipped_settings(sensor=unit.sensor, table=unit.table, procedure=unit.procedure)
         return shipped.replaced(
-            method=shipped.method.replaced(as_printed=as_printed),
-            procedure=shipped.procedure.replaced(holdout_every=0),
+            method=shipped.method.replaced(as_printed=as_printed), procedure=shipped.procedure.replaced(holdout_every=0)
         )
 
     def _accelerometer_error(self, correct: Callable[[Values], Values]) -> Row:

@@ -25,9 +25,8 @@ from imu_logs.units import CANONICAL, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.app.config.campaign import Campaign, UnitRow, cut_batches
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import as_list, key_of
-from pipeline.app.config.options import RUN_SETTINGS, SettingProblem, nearest, parse
+from pipeline.app.config.options import PYTHON, RUN_SETTINGS, SettingProblem, nearest, parse
 from pipeline.app.config.stage_settings import as_job_reads, settings_in_memory
-from pipeline.app.config.user_effects import PYTHON
 from pipeline.core.errors import (
     ConfigurationError,
     InputError,

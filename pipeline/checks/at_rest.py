@@ -102,10 +102,7 @@ def with_rates_at_rest(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def _doubted(
-    recording: Recording,
-    recordings: Sequence[Recording],
-    rests_of: Mapping[str, Values],
-    sensor_model: Sensor,
+    recording: Recording, recordings: Sequence[Recording], rests_of: Mapping[str, Values], sensor_model: Sensor
 ) -> Recording:
     """Return a static recording, with the note ``N-REFERENCE`` if it contradicts the rests of the others."""
     others = [r for r in recordings if r.role != "static" and r.samples > 1]

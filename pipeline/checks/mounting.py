@@ -117,11 +117,7 @@ def check_mounting(recordings: Sequence[Recording], settings: Settings) -> list[
 
 
 def _turns(
-    recordings: Sequence[Recording],
-    procedure: Procedure,
-    table: Table,
-    sensor: Sensor,
-    tolerance: float,
+    recordings: Sequence[Recording], procedure: Procedure, table: Table, sensor: Sensor, tolerance: float
 ) -> list[TurnRecording]:
     # Largest plausible time offset, which adds to the zero of turns in one direction.
     offset_s = sensor.accelerometer.effects.get("time_offset", TIME_OFFSET_S)

@@ -414,9 +414,7 @@ def with_noises(
 
 
 def required_noises(
-    recordings: UnitRecordings,
-    sensor_model: Sensor,
-    calibrations: Mapping[str, SensorCalibration | None],
+    recordings: UnitRecordings, sensor_model: Sensor, calibrations: Mapping[str, SensorCalibration | None]
 ) -> dict[str, Noise]:
     """Return the noise of each calibrated sensor; ``ConfigurationError`` if nothing determines it."""
     return {

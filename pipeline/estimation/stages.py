@@ -273,11 +273,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def fit_stage(
-    sensor: str,
-    stage: str,
-    recordings: UnitRecordings,
-    previous: SensorCalibration | None,
-    settings: Settings,
+    sensor: str, stage: str, recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
 ) -> SensorCalibration:
     """Run a stage on the result of the stage before.
 

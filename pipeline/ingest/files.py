@@ -17,28 +17,32 @@ Read the sheet of a unit's recordings, ``recordings.csv``: one row a file, which
 | ``label`` | any text |
 
 Columns may be left out, but for the first two. An error names the row, as a line of the file, and the column.
+
+The SHA-256 of the recordings of a unit is a sorted list of hexadecimal digests, one for each different file.
 """
 
 from __future__ import annotations
 
 import csv
+import hashlib
 import math
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from imu_logs.files import SUFFIXES, read_text
+from imu_logs.files import SUFFIXES, not_regular, read_text
 from pipeline.core.errors import ConfigurationError, IngestError, MissingInputError
 from pipeline.core.files import state_of_files
 from pipeline.core.records import AXES
 from pipeline.core.settings import FileKind, RecordingFile
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    from pipeline.core.pack import Pack
     from pipeline.core.settings import Ingest, Procedure, Settings
 
 
@@ -282,3 +286,35 @@ def _number(text: str) -> float | None:
 
 def _refusal(message: str, path: str, line: int) -> IngestError:
     return IngestError(message, f"{path}:{line}", code="sheet", hint=HINT)
+
+
+def digests_of_files(procedure: Procedure, ingest: Ingest, folder: Path) -> list[str]:
+    """Return the digests of the existing files of a unit's recordings; a file that cannot be read is left out."""
+    digests = set()
+    for path in {path for paths in recording_files(procedure, ingest, folder).values() for path in paths}:
+        try:
+            if not not_regular(path):
+                with path.open("rb") as stream:
+                    digests.add(hashlib.file_digest(stream, "sha256").hexdigest())
+        except OSError:
+            continue
+    return sorted(digests)
+
+
+def digests_of_entries(entries: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return the digests in ``inputs`` of a calibration document, or in the sources of recordings."""
+    digests = set()
+    for entry in entries:
+        digests |= {str(entry["sha256"])} if entry.get("sha256") else set()
+        digests |= set(digests_of_entries(entry.get("joined") or ()))
+    return sorted(digests)
+
+
+def digests_in_pack(ingested: Pack, unit: str) -> list[str] | None:
+    """Return the digests of a unit in the output of ingest; None if the unit failed there."""
+    if f"{unit}.parquet" not in ingested:
+        return None
+    from pipeline.ingest.arrow import from_parquet  # noqa: PLC0415  (pyarrow, where a unit has failed)
+
+    recordings = from_parquet(ingested.read(f"{unit}.parquet"), str(ingested.path))
+    return digests_of_entries(recording.source for recording in recordings)

@@ -121,10 +121,7 @@ def read_recordings(
 
 
 def read_table(
-    paths: Sequence[Path],
-    ingest: Ingest,
-    layouts: Sequence[CsvFormat] | None = None,
-    session: int | None = None,
+    paths: Sequence[Path], ingest: Ingest, layouts: Sequence[CsvFormat] | None = None, session: int | None = None
 ) -> Log:
     """Read the file or files of one recording, by their suffix; ``layouts`` are ``csv_formats(ingest)``.
 

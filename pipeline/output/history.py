@@ -156,10 +156,7 @@ def read_history(results: Path) -> list[JSON]:
 
 
 def record(
-    results: Path,
-    units: Mapping[str, JSON],
-    settings: Mapping[str, Any],
-    sections: Mapping[str, Any] | None = None,
+    results: Path, units: Mapping[str, JSON], settings: Mapping[str, Any], sections: Mapping[str, Any] | None = None
 ) -> list[JSON]:
     """Append the states of the units (name to state) that differ from their last ones; return all entries.
 

@@ -44,6 +44,7 @@ import numpy as np
 
 from imu_logs.files import not_regular
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError, shortened
+from pipeline.core.files import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
 from pipeline.core.pack import read_published
 from pipeline.core.records import (
     AXES,
@@ -62,7 +63,6 @@ from pipeline.core.records import (
     matrix_of,
 )
 from pipeline.core.verdicts import WITH_THEM
-from pipeline.physics.checked import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
 from pipeline.physics.effects import effect, effect_of
 from pipeline.physics.effects.base import parameter_limits
 
@@ -70,9 +70,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from pipeline.core.files import Check
     from pipeline.core.records import Values
     from pipeline.core.settings import DataSheet
-    from pipeline.physics.checked import Check
 
 
 DIFFERENT = 1.1  # ratio of both uncertainties above which pages, terminal and certificate state both

@@ -307,11 +307,7 @@ def table_motion(recording: Recording, table: Table) -> Motion | None:
 
 
 def reference_motion(
-    recording: Recording,
-    gravity_g: float = 1.0,
-    earth_rate_level: Values | None = None,
-    *,
-    one_shaft: bool = False,
+    recording: Recording, gravity_g: float = 1.0, earth_rate_level: Values | None = None, *, one_shaft: bool = False
 ) -> Motion | None:
     """Return the motion of a recording by the log of the table; None where the recording has no such log.
 
@@ -352,12 +348,7 @@ def _reference_motion(
 
 
 def _motion_of_turn(
-    recording: Recording,
-    gravity_g: float,
-    earth: Values | None,
-    logged: Callable[[Motion], Motion],
-    *,
-    shaft: int,
+    recording: Recording, gravity_g: float, earth: Values | None, logged: Callable[[Motion], Motion], *, shaft: int
 ) -> Motion:
     assert recording.axis is not None  # noqa: S101
     assert recording.table_angle is not None  # noqa: S101

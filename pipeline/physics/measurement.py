@@ -89,10 +89,7 @@ def predicted_reading(calibration: SensorCalibration, motion: Motion) -> Values:
 
 
 def compensate(
-    calibration: SensorCalibration,
-    reading: Values,
-    motion: Motion,
-    effects: Sequence[FittedEffect] | None = None,
+    calibration: SensorCalibration, reading: Values, motion: Motion, effects: Sequence[FittedEffect] | None = None
 ) -> Values:
     """Return the truth of (n, 3) readings of one sensor; the other fields of the motion are known.
 

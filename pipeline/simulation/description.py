@@ -39,10 +39,9 @@ from imu_logs.yaml_file import read_yaml
 from pipeline.core.errors import ConfigurationError, MissingInputError
 from pipeline.core.files import CONFIGS
 from pipeline.core.records import AXES
-from pipeline.core.settings import SECTIONS, Settings
+from pipeline.core.settings import SECTIONS, Settings, completed
 from pipeline.ingest.commanded_motion import Program
 from pipeline.ingest.files import wrong_name
-from pipeline.physics.sensor_file import completed
 from pipeline.simulation import REST_BY_HAND_S
 from pipeline.simulation.trajectory import (
     CommandedTurns,
@@ -487,13 +486,7 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--table", metavar="NAME", help="configs/table (acutronic; hand for procedures without a table)")
     add("--procedure", metavar="NAME", help="configs/procedure (three_axis_turns)")
     add("--samples", type=int, metavar="N", help="approximate rows of a unit; scales rests and held-out motion")
-    add(
-        "--interval",
-        dest="interval_s",
-        type=float,
-        metavar="S",
-        help="sampling interval in s (0.12; by hand 0.1)",
-    )
+    add("--interval", dest="interval_s", type=float, metavar="S", help="sampling interval in s (0.12; by hand 0.1)")
     add("--table-log", choices=DESCRIPTION_KINDS,
         help="where the table is logged: in the sensor's rows (the default), in a file with a separate clock, or not "
         "at all: then its program is known")  # fmt: skip

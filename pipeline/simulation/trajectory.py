@@ -247,13 +247,7 @@ class Gimbals:
         half = 0.5 * np.radians(self.angles(time)[0])
         (a, b, c), (x, y, z) = np.cos(half), np.sin(half)
         return np.stack(
-            [
-                a * b * c + x * y * z,
-                x * b * c - a * y * z,
-                a * y * c + x * b * z,
-                a * b * z - x * y * c,
-            ],
-            -1,
+            [a * b * c + x * y * z, x * b * c - a * y * z, a * y * c + x * b * z, a * b * z - x * y * c], -1
         )
 
     def pose(self, time: Values) -> Pose:

@@ -336,8 +336,7 @@ def with_profile(calibration: Path, csv_section: dict[str, Any], axis_map: Seque
 
 
 @pytest.mark.parametrize(
-    "changed",
-    [{"ingest": {"csv": {}, "delimiters": ";"}}, {"ingest": {"csv": "columns"}}, {"axis_map": ["+x"]}],
+    "changed", [{"ingest": {"csv": {}, "delimiters": ";"}}, {"ingest": {"csv": "columns"}}, {"axis_map": ["+x"]}]
 )
 def test_a_damaged_profile_of_a_calibration_is_refused_by_name(calibration: Path, changed: dict[str, Any]) -> None:
     data = json.loads(with_profile(calibration, counts_profile()).read_text(encoding="utf-8"))

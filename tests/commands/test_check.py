@@ -250,8 +250,7 @@ def test_parts_of_one_recording_are_read_together(tmp_path: Path, capsys: pytest
 
 
 @pytest.mark.parametrize(
-    "file",
-    ["mpu6050_multi_position/example_data_calibration.csv", "mpu6050_multi_position/imu_90_x_rot.csv"],
+    "file", ["mpu6050_multi_position/example_data_calibration.csv", "mpu6050_multi_position/imu_90_x_rot.csv"]
 )
 def test_published_logs_are_read_with_their_profile(file: str, capsys: pytest.CaptureFixture[str]) -> None:
     if not (REFERENCE / file).is_file():

@@ -181,10 +181,7 @@ def test_batches_grow_along_the_sheet_and_appending_still_touches_the_last_one_o
 def test_the_stage_of_effects_follows_where_a_unit_of_the_batch_asks_for_it(tmp_path: Path) -> None:
     directory = campaign(tmp_path, "unit,overrides\nA,\nB,effects.gyroscope=[g_sensitivity]\n")
     chains = load(directory).chains["reference_least_squares-0001"]
-    assert chains == {
-        "accelerometer": ["reference_least_squares"],
-        "gyroscope": ["reference_least_squares", "effects"],
-    }
+    assert chains == {"accelerometer": ["reference_least_squares"], "gyroscope": ["reference_least_squares", "effects"]}
 
 
 def test_a_stage_sees_its_own_settings_only(tmp_path: Path) -> None:

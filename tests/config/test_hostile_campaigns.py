@@ -98,8 +98,7 @@ def test_a_yaml_file_costs_no_more_than_its_size_explains(tmp_path: Path, file: 
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["${oc.env:IMU_SECRET}", "${${sensor.name}:IMU_SECRET}", "x${oc.env:IMU_SECRET,y}", "${oc.env:IMU_SECRET"],
+    "text", ["${oc.env:IMU_SECRET}", "${${sensor.name}:IMU_SECRET}", "x${oc.env:IMU_SECRET,y}", "${oc.env:IMU_SECRET"]
 )
 def test_no_resolver_is_run_wherever_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setenv("IMU_SECRET", "hunter2")

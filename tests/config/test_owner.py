@@ -121,8 +121,7 @@ def test_the_same_path_is_the_same_campaign_without_a_look_at_its_recordings(
 
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize(
-    ("others", "same"),
-    [({}, 1), ({"U3": "three"}, 1), ({"U2": "edited"}, 0), ({"U1": "two", "U2": "one"}, 0)],
+    ("others", "same"), [({}, 1), ({"U3": "three"}, 1), ({"U2": "edited"}, 0), ({"U1": "two", "U2": "one"}, 0)]
 )
 def test_another_path_is_the_same_campaign_by_the_recordings_of_all_units_in_both(
     bench: Bench, others: dict[str, str], same: int, version: int

@@ -56,11 +56,7 @@ def of(batch: str, *stages: str) -> set[str]:
             | {f"{REFERENCE}/fit/{s}/reference_least_squares" for s in ("accelerometer", "gyroscope")}
             | {f"{REFERENCE}/fit/gyroscope/effects"},
         ),
-        (
-            "B1",
-            "filter.zero_phase=true",
-            of(STAGED, "filter", "calibration", "report"),
-        ),
+        ("B1", "filter.zero_phase=true", of(STAGED, "filter", "calibration", "report")),
         (
             "A2",
             "effects.gyroscope=[bias_temperature]",

@@ -20,13 +20,13 @@ SECTIONS = {
 # Modules and packages with functions that take JSON, by the reason.
 TAKE_JSON = {
     "the configuration, effects, profiles and simulations as files state them, before they are checked": (
-        "app/commands/config.py", "app/config/", "physics/effects/", "physics/sensor_file.py",
+        "app/commands/config.py", "app/config/", "physics/effects/",
         "core/settings.py", "simulation/",
     ),
     "documents of a run: written, read, and shown on pages, by commands and in formats of other programs": (
         "app/commands/explain.py", "app/commands/noise.py", "evaluation/diagnosis/words.py", "output/exports/",
         "app/field_logs/stream.py", "output/history.py", "ingest/arrow.py", "ingest/axis_maps.py", "app/one_unit.py",
-        "ingest/digests.py", "physics/calibration_file.py", "physics/compensation.py",
+        "ingest/files.py", "physics/calibration_file.py", "physics/compensation.py",
         "output/outcome.py", "app/planning/plan.py", "core/records/",
         "output/pages/", "app/results_folder.py", "app/steps/", "core/verdicts.py",
     ),

@@ -22,12 +22,7 @@ from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
 from pipeline.evaluation.diagnosis import turntable
-from pipeline.evaluation.diagnosis.formula_discovery import (
-    Discovery,
-    discover,
-    suggested_effect,
-    why_not_suggested,
-)
+from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, suggested_effect, why_not_suggested
 from pipeline.evaluation.diagnosis.functional_forms import (
     Factor,
     Form,

@@ -104,11 +104,7 @@ def held_out(after: float) -> SelectionErrors:
         (replace(BEYOND, held_out=held_out(after=0.3), published=ABOVE, full=INSIDE), "missing_effect", "sensor file"),
         (STAGED, "left_by_method", "the method staged causes the rest"),
         (replace(STAGED, filtered=True), "left_by_method", "the method staged and the filter cause the rest"),
-        (
-            replace(STAGED, filtered=True, **REFERENCE),
-            "left_by_method",
-            "delay and smoothing by the filter",
-        ),
+        (replace(STAGED, filtered=True, **REFERENCE), "left_by_method", "delay and smoothing by the filter"),
         (replace(NOTHING, **OF_STAGED, approximations=("rotation", "bias")), "left_by_method", "rotation, bias"),
         (replace(MISSING, **OF_STAGED, approximations=("rotation",)), "missing_effect", ""),
         (replace(STAGED, free=ABOVE, as_printed=True), "left_by_method", "as_printed"),

@@ -7,11 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.engine import (
-    COSINE_AT_MINIMUM,
-    ScaledColumns,
-    linear_convergence_evidence,
-)
+from pipeline.estimation.engine import COSINE_AT_MINIMUM, ScaledColumns, linear_convergence_evidence
 from pipeline.estimation.multi_position.fit import MAX_STEP_HALVINGS
 
 if TYPE_CHECKING:

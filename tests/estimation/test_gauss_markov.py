@@ -46,11 +46,7 @@ def test_the_covariance_of_averages_is_the_integral_over_both_blocks() -> None:
     for j in range(2):
         for k in range(2):
             inner = dblquad(
-                lambda s, t: np.exp(-abs(s - t) / tau),
-                start[j],
-                start[j] + length[j],
-                start[k],
-                start[k] + length[k],
+                lambda s, t: np.exp(-abs(s - t) / tau), start[j], start[j] + length[j], start[k], start[k] + length[k]
             )[0]
             assert B[j, k] == pytest.approx(inner / (length[j] * length[k]), rel=1e-6)
     assert variance_of_average(np.array([0.0, 1e-4]), 1.0) == pytest.approx([1.0, 1.0 - 1e-4 / 3.0], abs=1e-9)

@@ -211,10 +211,7 @@ def test_a_turn_without_temperature_leaves_the_sensor_uncalibrated_with_the_reas
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (
-            ["method=after", *KNOWN],
-            "cannot follow reference_least_squares: it does not honour bias",
-        ),
+        (["method=after", *KNOWN], "cannot follow reference_least_squares: it does not honour bias"),
         (["method=judged", *KNOWN], "given cannot follow known_temperature: it does not honour readings"),
         (["method=alone", *KNOWN], "no stage fits bias or matrix"),
         (

@@ -139,9 +139,7 @@ def in_python(folder: Path, made: dict[str, Any], *, alone: bool = False) -> np.
 
 @needs_compiler
 @pytest.mark.parametrize(
-    "effects",
-    [{}, ONE_ROUND, IN_TURN, LEVERS, ALGEBRA],
-    ids=["linear", "one round", "in turn", "levers", "algebra"],
+    "effects", [{}, ONE_ROUND, IN_TURN, LEVERS, ALGEBRA], ids=["linear", "one round", "in turn", "levers", "algebra"]
 )
 def test_samples_in_c_are_those_of_python_to_the_last_bit(tmp_path: Path, effects: dict[str, dict[str, float]]) -> None:
     made = document(effects)

@@ -236,10 +236,7 @@ def cases() -> dict[str, Case]:
             changed(5, "0.05,0.1"), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP, flags={5: 1}
         ),
         "10 line break in a number": one(
-            changed(5, ROWS[5][:-2] + "\n" + ROWS[5][-2:]),
-            notes=("N-BADROW", "N-GAP"),
-            kept=without(5),
-            settings=DROP,
+            changed(5, ROWS[5][:-2] + "\n" + ROWS[5][-2:]), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP
         ),
         "10 over budget": one(
             text([r if i % 100 else "x" for i, r in enumerate(ROWS)]),
@@ -398,9 +395,7 @@ def cases() -> dict[str, Case]:
             text([*ROWS[:1500], *ROWS[1480:1500], *ROWS[1480:]]), notes=("N-REPEAT", "N-REPEAT"), kept=ALL
         ),
         "33 a block twice that differs": one(
-            text([*ROWS[:1500], *ROWS[1480:1499], ROWS[1499] + "9", *ROWS[1500:]]),
-            fault="time_back",
-            says="goes back",
+            text([*ROWS[:1500], *ROWS[1480:1499], ROWS[1499] + "9", *ROWS[1500:]]), fault="time_back", says="goes back"
         ),
         "33 session": one(
             text([*ROWS[:1500], *ROWS[200:1000]]), notes=("N-SESSION",), kept=ALL[200:1000], settings={"csv/session": 2}
@@ -449,11 +444,7 @@ def cases() -> dict[str, Case]:
             says=r"16.694% of the time is missing; the times are multiples of 1 ms; if they are rounded and no row is "
             r"missing, count the rows: .*ingest.csv.rate_hz=833.056",
         ),
-        "35 bursts": one(
-            times([f"{0.08 * (i // 8):.2f}" for i in range(SAMPLES)]),
-            notes=("N-BURSTS",),
-            kept=ALL,
-        ),
+        "35 bursts": one(times([f"{0.08 * (i // 8):.2f}" for i in range(SAMPLES)]), notes=("N-BURSTS",), kept=ALL),
         "35 two logs": one(
             two_logs(),
             fault="bursts",
@@ -466,9 +457,7 @@ def cases() -> dict[str, Case]:
             kept=ALL,
         ),
         "37 too much": one(
-            times([f"{0.01 * i + 0.008 * (i % 2):.3f}" for i in range(SAMPLES)]),
-            notes=("N-JITTER",),
-            kept=ALL,
+            times([f"{0.01 * i + 0.008 * (i % 2):.3f}" for i in range(SAMPLES)]), notes=("N-JITTER",), kept=ALL
         ),
         "38": one(stuck(), notes=("N-STUCK",), flags={1000: 4, 1099: 4}),
         "38 half": one(stuck(2900), fault="stuck", says="gyro_y stays at one value .* in 1900 of 3000 rows"),

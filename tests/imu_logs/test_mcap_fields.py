@@ -206,10 +206,7 @@ def test_lists_counts_and_integer_times_are_read(tmp_path: Path) -> None:
         (json_imu(1, angular_velocity={"x": 1.0}), "it has no field angular_velocity.y; there are x"),
         (json_imu(1, angular_velocity={"x": "1", "y": 0, "z": 0}), "angular_velocity.x is '1'; a number is expected"),
         (json_imu(1, angular_velocity={"x": True, "y": 0, "z": 0}), "angular_velocity.x is True; a number"),
-        (
-            json_imu(1, angular_velocity={"x": float("nan"), "y": 0, "z": 0}),
-            r"gyro_x is nan at 2.00000001 s \(1 such",
-        ),
+        (json_imu(1, angular_velocity={"x": float("nan"), "y": 0, "z": 0}), r"gyro_x is nan at 2.00000001 s \(1 such"),
         (json_imu(1, timestamp={"sec": 2, "nsec": SECOND}), "its stamp has 1000000000 nanoseconds"),
         (json_imu(1, timestamp="yesterday"), "timestamp is 'yesterday'; a number, or seconds and nanoseconds"),
         (json_imu(1, timestamp=10**30), "its stamp of 10+ ns is out of range"),

@@ -263,8 +263,7 @@ def in_columns(truth: Truth, *parts: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "arrays",
-    [{"acc": "tf", "gyr": "tw"}, {"data": "tfw"}, {"imu_log": "twf"}, {"acc": "f", "gyr": "w", "t": "t"}],
+    "arrays", [{"acc": "tf", "gyr": "tw"}, {"data": "tfw"}, {"imu_log": "twf"}, {"acc": "f", "gyr": "w", "t": "t"}]
 )
 @pytest.mark.parametrize("suffix", [".mat", ".h5"])
 def test_the_time_in_the_first_column_of_an_array_is_no_reading(

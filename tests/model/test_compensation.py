@@ -258,8 +258,7 @@ def test_a_ramp_of_temperature_passes_without_lag_and_a_gap_is_bridged() -> None
 
 
 @pytest.mark.parametrize(
-    ("name", "missing"),
-    [("g_sensitivity", "accelerometer"), ("bias_temperature", "temperature"), ("warm_up", "time")],
+    ("name", "missing"), [("g_sensitivity", "accelerometer"), ("bias_temperature", "temperature"), ("warm_up", "time")]
 )
 def test_a_missing_signal_is_named(name: str, missing: str) -> None:
     c = calibration("gyroscope", (fitted(name, "gyroscope"),))

@@ -221,8 +221,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(
-    ("line", "instead", "number", "message"),
-    [(line, *wrong) for line, wrongs in WRONG.items() for wrong in wrongs],
+    ("line", "instead", "number", "message"), [(line, *wrong) for line, wrongs in WRONG.items() for wrong in wrongs]
 )
 def test_a_wrong_definition_is_refused_with_its_line(
     line: str, instead: str, number: int | None, message: str, tmp_path: Path

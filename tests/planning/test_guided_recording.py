@@ -22,9 +22,7 @@ from pipeline.app.planning.guide import (
     most_informative_turn,
     propose,
 )
-from pipeline.app.planning.guide import (
-    progress_of as progress_of_unit,
-)
+from pipeline.app.planning.guide import progress_of as progress_of_unit
 from pipeline.core.records import Recording, SensorCalibration
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.simulation.description import shipped_settings

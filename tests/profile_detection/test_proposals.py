@@ -300,9 +300,9 @@ def test_a_matlab_file_of_hdf5_is_named(tmp_path: Path) -> None:
                         "csv": {
                             "rate_hz": 1.0,
                             "columns": {c: {"column": c, "unit": "g"} for c in ("accel_x", "accel_y", "accel_z")},
-                        },
-                    },
-                ),
+                        }
+                    }
+                )
             ),
         )
 

@@ -200,8 +200,7 @@ def test_effects_are_added_one_by_one_in_their_order() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sensor", "name", "size"),
-    [("accelerometer", "scale_factor_asymmetry", 5e-3), ("gyroscope", "g_sensitivity", 0.1)],
+    ("sensor", "name", "size"), [("accelerometer", "scale_factor_asymmetry", 5e-3), ("gyroscope", "g_sensitivity", 0.1)]
 )
 def test_effects_work_from_the_logs_own_signals_without_an_attitude(sensor: str, name: str, size: float) -> None:
     unit = {s: calibration(s) for s in SENSORS}

@@ -26,11 +26,10 @@ from pipeline.app.run_progress import Countdown
 from pipeline.core.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, shortened
 from pipeline.core.files import write_atomically
 from pipeline.core.records import SENSORS
-from pipeline.core.settings import Ingest
+from pipeline.core.settings import Ingest, settings_of_ranges
 from pipeline.ingest.files import FILE, recording_files
 from pipeline.output.outcome import NAMED_PER_LINE, as_overrides, found_mountings
 from pipeline.physics.calibration_file import LEFT_OUT_REASONS
-from pipeline.physics.sensor_file import settings_of_ranges
 
 if TYPE_CHECKING:
     import argparse

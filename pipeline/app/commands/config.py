@@ -13,11 +13,10 @@ import yaml
 
 from pipeline.app.commands import parser_of
 from pipeline.app.config.campaign import find_campaign, read_layers
-from pipeline.app.config.options import GROUPS, SettingProblem, default_option, nearest, parse, read_option
-from pipeline.app.config.user_effects import PYTHON
+from pipeline.app.config.options import GROUPS, PYTHON, SettingProblem, default_option, nearest, parse, read_option
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
-from pipeline.physics.sensor_file import REQUIRED_FIGURES, range_settings
+from pipeline.core.settings import REQUIRED_FIGURES, range_settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -11,10 +11,10 @@ from pipeline.app.planning.plan import readme
 from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.files import CONFIGS
 from pipeline.core.records import SENSOR_UNITS, SENSORS
+from pipeline.core.settings import settings_of_ranges
 from pipeline.ingest.files import EXAMPLE
 from pipeline.output.outcome import run_command
 from pipeline.output.pages.pages import template
-from pipeline.physics.sensor_file import settings_of_ranges
 from pipeline.simulation.description import TABLE_PROCEDURES, UnitDescription, described, read_option, shipped_settings
 
 if TYPE_CHECKING:

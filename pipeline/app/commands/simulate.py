@@ -15,9 +15,9 @@ from pipeline.app.planning.plan import not_shown
 from pipeline.app.results_folder import new_simulated, publish_simulated
 from pipeline.app.run_progress import Countdown
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.settings import assumed_figures
 from pipeline.output.outcome import run_command
 from pipeline.physics.effects import read_effect_files, register
-from pipeline.physics.sensor_file import assumed_figures
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import (
     FORMATS,

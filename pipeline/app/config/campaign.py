@@ -36,9 +36,8 @@ from pydantic import ValidationError
 from imu_logs.units import SENSORS
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import as_list, load_layers
-from pipeline.app.config.options import GROUPS, RUN_SETTINGS, SettingProblem, mapping_of, nearest, parse
+from pipeline.app.config.options import GROUPS, PYTHON, RUN_SETTINGS, SettingProblem, mapping_of, nearest, parse
 from pipeline.app.config.stage_settings import last_stage
-from pipeline.app.config.user_effects import PYTHON
 from pipeline.core.errors import ConfigurationError, shortened
 from pipeline.core.files import CONFIGS, JSON, SHIPPED, canonical_json
 from pipeline.core.settings import RunSettings

@@ -25,23 +25,21 @@ from pydantic import ValidationError
 from imu_logs.profile import checks_of, csv_formats, mcap_formats
 from imu_logs.units import SENSORS
 from pipeline.app.config.options import (
+    GIVEN,
     GROUPS,
+    ONLY_FROM_THE_COMMAND_LINE,
+    PYTHON,
     RUN_SETTINGS,
     SettingProblem,
+    UserEffects,
     default_option,
+    load_user_effects,
     mapping_of,
     nearest,
     parse,
     read_option,
-    with_references,
-)
-from pipeline.app.config.user_effects import (
-    GIVEN,
-    ONLY_FROM_THE_COMMAND_LINE,
-    PYTHON,
-    UserEffects,
-    load_user_effects,
     with_given,
+    with_references,
 )
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS, state_of_files
@@ -56,11 +54,13 @@ from pipeline.core.settings import (
     Settings,
     Stages,
     Unit,
+    completed,
+    range_settings,
+    without_overridden,
 )
 from pipeline.core.user_cache import from_cache, to_cache
 from pipeline.estimation.stages import NOT_WANTED, check_stages, declared
 from pipeline.ingest.files import candidate_files, with_sheet
-from pipeline.physics.sensor_file import completed, range_settings, without_overridden
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

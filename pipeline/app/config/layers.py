@@ -33,8 +33,16 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from imu_logs.files import not_regular, read_text
 from imu_logs.yaml_file import read_yaml
-from pipeline.app.config.options import GROUPS, RUN_SETTINGS, SettingProblem, default_option, nearest, parse
-from pipeline.app.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
+from pipeline.app.config.options import (
+    GROUPS,
+    ONLY_FROM_THE_COMMAND_LINE,
+    PYTHON,
+    RUN_SETTINGS,
+    SettingProblem,
+    default_option,
+    nearest,
+    parse,
+)
 from pipeline.core.errors import ConfigurationError, shortened
 from pipeline.ingest.files import wrong_name
 

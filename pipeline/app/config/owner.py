@@ -39,7 +39,7 @@ from pipeline.app.run_progress import Countdown, wait_for_jobs
 from pipeline.core.errors import PipelineError, shortened
 from pipeline.core.files import read_json
 from pipeline.core.pack import Pack, read_published
-from pipeline.ingest.digests import digests_in_pack, digests_of_entries, digests_of_files
+from pipeline.ingest.files import digests_in_pack, digests_of_entries, digests_of_files
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from imu_logs.units import SENSORS
-from pipeline.app.config.user_effects import GIVEN, effects_for
+from pipeline.app.config.options import GIVEN, effects_for
 from pipeline.core.files import CONFIGS, canonical_json
 from pipeline.core.settings import OF_BENCH, Board, Settings, Stated, Unit
 from pipeline.ingest.files import state_of_recordings

@@ -30,6 +30,7 @@ import numpy as np
 from pipeline.app.planning.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import AXES, SENSORS, Noise, NotCalibrated, Recording, SensorCalibration
+from pipeline.core.settings import assumed_figures
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
@@ -40,7 +41,6 @@ from pipeline.output.pages.pages import template
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import Owner, unit_of
 from pipeline.physics.kinematics import LEVEL_AT_ZERO
-from pipeline.physics.sensor_file import assumed_figures
 from pipeline.physics.signal.rests import SETTLING_S
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import TABLE_PROCEDURES, Course, UnitDescription, course_of, plan, shipped_settings

@@ -52,11 +52,7 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
 OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous")}
 AFTER_FIT = ("diagnose", "export", "report", "summary", "prior")  # a calibration does not depend on them
 INPUTS_OF = ".inputs"  # member of a pack: digest of a unit's inputs, and the names of its files
-OF_OTHERS = (
-    "again",
-    "recordings",
-    "last",
-)  # settings by unit, of which ``<stage>_reads`` returns those of one
+OF_OTHERS = ("again", "recordings", "last")  # settings by unit, of which ``<stage>_reads`` returns those of one
 
 
 @dataclass(frozen=True)

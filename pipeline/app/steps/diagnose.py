@@ -38,11 +38,7 @@ class Diagnosis:
 
 
 def diagnose_unit(
-    unit: str,
-    recordings: UnitRecordings,
-    fits: Mapping[str, Fit],
-    validated: Validation,
-    settings: Settings,
+    unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit], validated: Validation, settings: Settings
 ) -> Diagnosis:
     """Diagnose which physical effects the models of both sensors lack.
 

@@ -24,13 +24,7 @@ def fit_reads(job: Job, unit: str, settings: Settings) -> str:  # noqa: ARG001
 
 
 def fit(
-    recordings: UnitRecordings,
-    fits: Mapping[str, Fit],
-    settings: Settings,
-    *,
-    sensor: str,
-    stage: str,
-    last: bool,
+    recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings, *, sensor: str, stage: str, last: bool
 ) -> Fit:
     """Fit one stage of a method to one sensor, on the result of the stage before it in ``fits``.
 

@@ -27,7 +27,7 @@ from pipeline.core.errors import PipelineError, failure_of
 from pipeline.core.files import JSON, flushed_together, read_json, write_atomically, write_json
 from pipeline.core.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch, Pack, as_bytes, batches_of, is_published
 from pipeline.core.version import VERSION
-from pipeline.ingest.digests import digests_in_pack
+from pipeline.ingest.files import digests_in_pack
 from pipeline.output.history import of_units, record
 from pipeline.output.pages.campaign_page import render
 from pipeline.output.pages.comparison import against_truth, section

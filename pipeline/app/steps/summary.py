@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.core.errors import PipelineError
 from pipeline.core.settings import Stated
-from pipeline.ingest.digests import digests_of_entries
+from pipeline.ingest.files import digests_of_entries
 from pipeline.output.history import unit_state
 from pipeline.output.pages.pages import failure_page
 from pipeline.output.pages.parameters import sheet_columns, summary_row, unit_parameters

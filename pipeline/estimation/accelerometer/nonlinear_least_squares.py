@@ -348,11 +348,7 @@ def _outlier(rows: Orientations, solved: _Solved) -> dict[int, str]:
 
 
 def _on_table(
-    rows: Orientations,
-    solved: _Solved,
-    before: SensorCalibration,
-    prior: WanderPrior,
-    settings: Settings,
+    rows: Orientations, solved: _Solved, before: SensorCalibration, prior: WanderPrior, settings: Settings
 ) -> SensorCalibration:
     """Return the calibration under white noise and bias wander, estimated from the residuals of ``y = b + K u``.
 

@@ -73,7 +73,7 @@ NAME = "cholesky_lu"
 FIT_STAGES = {
     NAME: FitStage(
         sensors=("gyroscope",), needs=("bias",), changes=("matrix",), accepts=("readings", "bias"), free=True
-    ),
+    )
 }
 DIFFERENCE_STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-9 of the derivative
 MOTION_SHARE = 0.01  # of the largest rate, above which the table turns

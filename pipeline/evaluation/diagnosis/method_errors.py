@@ -110,12 +110,7 @@ class _Difference:
 
     @classmethod
     def of(
-        cls,
-        method: SensorCalibration,
-        bias: Values,
-        K: Values,
-        of_free: tuple[Values | None, Any],
-        settings: Settings,
+        cls, method: SensorCalibration, bias: Values, K: Values, of_free: tuple[Values | None, Any], settings: Settings
     ) -> _Difference:
         """Return the difference from a free fit.
 
@@ -128,11 +123,7 @@ class _Difference:
                 variance += np.diag(J @ covariance[BASE, BASE] @ J.T)
         E = M @ K - np.eye(3)
         diagonal = np.diag(np.diag(E))
-        parts = {
-            "scale_factor": diagonal,
-            "non_orthogonality": 0.5 * (E + E.T) - diagonal,
-            "rotation": 0.5 * (E - E.T),
-        }
+        parts = {"scale_factor": diagonal, "non_orthogonality": 0.5 * (E + E.T) - diagonal, "rotation": 0.5 * (E - E.T)}
         return cls(method, M @ (bias - method.bias), parts, np.sqrt(np.clip(variance, 0.0, None)))
 
     def errors(self, motion: Motion, free: JointFit) -> dict[str, Values]:

@@ -235,10 +235,7 @@ def gravity_direction(
     if model.moves is None:
         return {"reason": "no move is held out"}
     terms = tuple(EffectColumns(effect(e.name), e.values) for e in gyroscope.effects)
-    states = {
-        "before": State(np.zeros(3), np.eye(3)),
-        "after": State(gyroscope.bias, gyroscope.matrix, terms),
-    }
+    states = {"before": State(np.zeros(3), np.eye(3)), "after": State(gyroscope.bias, gyroscope.matrix, terms)}
     errors = {name: model.direction_errors(state) for name, state in states.items()}
     found: dict[str, Any] = {"reason": None, "moves": model.moves.count}
     found["mean_deg"] = {name: float(np.mean(error)) for name, (error, _) in errors.items()}

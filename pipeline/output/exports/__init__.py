@@ -34,7 +34,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from pipeline.core.compiled_templates import CompiledTemplates
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.files import JSON  # noqa: TC001  (pydantic reads the fields' types)
+from pipeline.core.files import JSON, Check, WrongValueError, each, fields, one_of
 from pipeline.core.records import SENSORS, FittedEffect, SensorCalibration
 from pipeline.output.exports.sensors import (
     TEMPLATE_FUNCTIONS,
@@ -45,7 +45,6 @@ from pipeline.output.exports.sensors import (
     noise_figures,
     plain,
 )
-from pipeline.physics.checked import Check, WrongValueError, each, fields, one_of
 from pipeline.physics.compensation import OF_THE_PAST, SMOOTHING_S, Steps, circular
 from pipeline.physics.effects import effect_of
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE

@@ -32,8 +32,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, InputError
+from pipeline.core.files import Check, WrongValueError, each, expected, fields, flag, items, one_of, text
 from pipeline.core.records import AXES, SENSORS, Motion, Values
-from pipeline.physics.checked import Check, WrongValueError, each, expected, fields, flag, items, one_of, text
 from pipeline.physics.effects.base import (
     Effect,
     EffectParameter,

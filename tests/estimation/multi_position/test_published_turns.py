@@ -92,10 +92,7 @@ def read(folder: Path, file: str, counts: tuple[float, float] | None, hz: float)
         columns |= {f"{channel}_{axis}": {"column": f"{short}_{axis}", **scale} for axis in "xyz"}
     ingest = plain.replaced(csv=plain.csv | {"columns": columns, "rate_hz": hz})
     settings = settings_of(
-        sensor="generic",
-        table="hand",
-        procedure="ferraris",
-        **{f"sensor.{name}.full_scale": 2000.0 for name in FITS},
+        sensor="generic", table="hand", procedure="ferraris", **{f"sensor.{name}.full_scale": 2000.0 for name in FITS}
     )
     return read_recordings(PROCEDURE, ingest, settings.sensor, folder), settings
 
