@@ -172,7 +172,8 @@ def table(unit: Unit, sensors: str, logged: str) -> None:
         on_table(unit, sensors, axis, logged)
     up, stop = np.eye(3)[2], 360.0 + 0.5 * unit.rng.normal()
     unit.write("still", "rest,,,,", *at_rest(20.0, up), sensors)
-    turn = joined(at_rest(4.0, up), turned(stop, 90.0, np.eye(3)[0], up), at_rest(4.0, up))
+    end = rotation(np.eye(3)[0], np.array([-np.radians(stop)]))[0] @ up
+    turn = joined(at_rest(4.0, up), turned(stop, 90.0, np.eye(3)[0], up), at_rest(4.0, end))
     unit.write("hand", "turn,x,360,0.5,", *turn, sensors)
 
 

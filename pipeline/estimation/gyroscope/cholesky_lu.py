@@ -26,12 +26,13 @@ wander, and the derivatives with respect to A give the covariance of S, T, M and
 
 are by the trapezoidal rule on the timestamps, so that noise and a delay between reading and reference have little
 effect. A turn is the time in which the table's rate is above a threshold, in one direction, plus the time in which the
-output of a filter still changes.
+output of a filter still changes. Turns of a sheet have U by their known angles (``known_turns``).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -52,6 +53,7 @@ from pipeline.core.records import (
     Values,
 )
 from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative, linear_convergence_evidence
+from pipeline.estimation.gyroscope.known_turns import covariances, known_turns, with_budget
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.multi_position.moves import trapezoids
 from pipeline.estimation.noise import wander_prior
@@ -115,6 +117,8 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     Role ``gyroscope``, on a table, after the stage ``bias``.
     """
     assert previous is not None  # noqa: S101  (it needs the bias: FIT_STAGES)
+    if settings.procedure.sheet is not None:
+        return _fit_of_sheet(recordings, previous, settings)
     turns, Y, U, columns, A = forward_of(recordings.filtered, previous.bias, settings.table)
     as_printed = settings.method.as_printed
     factors = factorise(A)
@@ -169,6 +173,42 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     return budgeted(found, reference, fit.results(BASE), noise, lines, settings, results)
 
 
+def _fit_of_sheet(recordings: UnitRecordings, previous: SensorCalibration, settings: Settings) -> SensorCalibration:
+    """Fit the matrix to turns by known angles (``known_turns``)."""
+    known = known_turns(recordings, settings)
+    require_turns(known.U)
+    columns, as_printed = ScaledColumns.of(known.U), settings.method.as_printed
+    A = columns.solve(known.Y).T
+    of_noise, of_stated = covariances(known, A, columns)
+    theta = np.column_stack([previous.bias, A]).ravel()
+    results = partial(_results, as_printed=as_printed)
+    J = derivative(results, theta, np.full(theta.size, DIFFERENCE_STEP))
+    factors, after = factorise(A), J @ (of_noise + of_stated) @ J.T
+    matrix, left = calibration_matrix(A, as_printed=as_printed), known.Y - known.U @ A.T
+    stage = StageResult(
+        name=NAME,
+        parameters=stage_parameters(_values(factors), after[AFTER_BASE, AFTER_BASE]),
+        residual_rms=float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
+        correction=(Subtract(previous.bias), Multiply(matrix)),
+        details={
+            "turns": len(known.U),
+            "rests": len(known.rests.time),
+            "orthonormality_error": float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
+            "determinant_of_M": float(np.linalg.det(factors.M)),
+            "condition": float(np.linalg.cond(known.U / np.linalg.norm(known.U, axis=0))),
+        },
+    )
+    found = SensorCalibration(
+        sensor="gyroscope",
+        bias=previous.bias,
+        matrix=matrix,
+        stages=(*previous.stages, stage),
+        convergence=linear_convergence_evidence(known.U, left, columns.condition, columns.rank),
+    )
+    base = J[BASE]
+    return with_budget(found, base @ of_noise @ base.T, base @ of_stated @ base.T, settings)
+
+
 def factorise(A: Values) -> Factors:
     """Return S (positive), T (unit lower triangular) and M (orthonormal) with ``A = S T M``."""
     L = np.linalg.cholesky(A @ A.T)
@@ -179,6 +219,13 @@ def factorise(A: Values) -> Factors:
 def calibration_matrix(A: Values, *, as_printed: bool) -> Values:
     """Return the matrix of the calibration: the inverse of A, or A itself as printed."""
     return A if as_printed else np.asarray(np.linalg.solve(A, np.eye(3)))
+
+
+def _results(theta: Values, *, as_printed: bool) -> Values:
+    """Return bias, matrix, S, T and M (12 + 15) of the rows of bias and A, (12,)."""
+    channels = theta.reshape(3, 4)
+    found = [value for value, _ in _values(factorise(channels[:, 1:])).values()]
+    return np.concatenate([channels[:, 0], calibration_matrix(channels[:, 1:], as_printed=as_printed).ravel(), found])
 
 
 def _linear_map(
@@ -199,13 +246,7 @@ def _linear_map(
         weights += lever[:, None] * np.where(turns.rest, 1.0 / turns.rest.sum(), 0.0)
     theta, of_bias = np.column_stack([previous.bias, A]).ravel(), np.zeros((27, 27))
 
-    def results(values: Values) -> Values:
-        channels = values.reshape(3, 4)
-        found = [value for value, _ in _values(factorise(channels[:, 1:])).values()]
-        return np.concatenate(
-            [channels[:, 0], calibration_matrix(channels[:, 1:], as_printed=as_printed).ravel(), found]
-        )
-
+    results = partial(_results, as_printed=as_printed)
     x, y, z = np.split(derivative(results, theta, np.full(theta.size, DIFFERENCE_STEP)), 3, axis=1)
     if not from_rests and previous.covariance is not None:
         for channel, J in enumerate((x, y, z)):

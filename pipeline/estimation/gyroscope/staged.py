@@ -178,6 +178,10 @@ def fit(
 
     Role ``gyroscope``, on a table; also role ``static`` if these recordings hold no rest.
     """
+    if settings.procedure.sheet is not None and name == "bias":
+        from pipeline.estimation.gyroscope.known_turns import fit_bias  # noqa: PLC0415  (only for turns of a sheet)
+
+        return fit_bias(recordings, settings)
     before = [stage.name for stage in previous.stages] if previous else []
     samples, weights, theta, response = estimates_of(recordings.filtered, settings)
     prior = wander_prior(recordings.noises["gyroscope"], settings.sensor.gyroscope)

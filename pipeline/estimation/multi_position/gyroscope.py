@@ -386,11 +386,11 @@ def model_of(
         fewest=1 if sheet else MIN_MOVES,
         turns=turns,
         known_by_limit=known_by_limit,
-        between=_between_recordings(rests, turns, noise) if sheet else 0.0,
+        between=between_recordings(rests, turns, noise) if sheet else 0.0,
     )
 
 
-def _between_recordings(rests: Rests, turns: TurnsByHand | None, noise: Noise | None) -> float:
+def between_recordings(rests: Rests, turns: TurnsByHand | None, noise: Noise | None) -> float:
     """Return the standard deviation of the bias from one recording to the next, over white noise.
 
     By the scatter of the means of the rests of each recording; with rests in one recording only, and turns in others,

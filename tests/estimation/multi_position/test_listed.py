@@ -134,6 +134,24 @@ def test_a_turn_in_the_other_sense_is_refused_with_the_angle_that_agrees(tmp_pat
         calibrated(tmp_path)
 
 
+def test_cholesky_and_lu_work_on_turns_by_known_angles(tmp_path: Path) -> None:
+    unit = with_three_turns(tmp_path)
+    result = pipeline.calibrate(
+        tmp_path, sensor=SENSOR, procedure="listed", method="cholesky_lu", overrides=["diagnosis.depth=standard"]
+    )
+    part = result.calibration["gyroscope"]
+    assert [stage["name"] for stage in part["stages"]] == ["bias", "cholesky_lu"]
+    assert np.abs(errors(unit, result.calibration, "gyroscope", in_case=True)).max() < 1.5
+    # S T M of the true forward matrix, by their definition
+    L, found = np.linalg.cholesky(unit.K["gyroscope"] @ unit.K["gyroscope"].T), part["stages"][-1]["parameters"]
+    for i, axis in enumerate("xyz"):
+        S = found[f"S_{axis}"]
+        assert abs(S["value"] - L[i, i]) < 3.0 * S["standard_uncertainty"]
+    # One turn by 360 deg an axis: the axis' 1.5 deg are the uncertainty of each cross-axis term.
+    u = np.array(part["standard_uncertainty"]["matrix"])
+    assert u[~np.eye(3, dtype=bool)] == pytest.approx(np.radians(1.5), rel=0.1)
+
+
 @pytest.mark.parametrize(("sensors", "logged"), [("ag", "angle"), ("g", "rate")])
 def test_turns_on_a_table_and_by_hand_are_one_calibration(tmp_path: Path, sensors: str, logged: str) -> None:
     unit = Unit(tmp_path, np.random.default_rng(11))
