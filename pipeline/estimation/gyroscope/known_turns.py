@@ -25,12 +25,7 @@ from pipeline.estimation.multi_position.gyroscope import between_recordings
 from pipeline.estimation.multi_position.result import NOT_INCLUDED
 from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.table_errors import TIME_BASE
-from pipeline.estimation.uncertainty_budget import (
-    clock_contribution,
-    combined,
-    scatter_contribution,
-    stage_parameters,
-)
+from pipeline.estimation.uncertainty_budget import clock_contribution, combined, scatter_contribution, stage_parameters
 
 if TYPE_CHECKING:
     from pipeline.core.records import UnitRecordings, Values
