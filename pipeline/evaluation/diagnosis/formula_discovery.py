@@ -97,12 +97,15 @@ class Forms:
     def column(self, text: str) -> Values:
         """Return a formula's values: (n, 1) array, or (n, 3) if the formula contains ``u``."""
         if text not in self._columns:
-            self._columns[text] = self.scan.values(forms.columns_of([text], self.sensor))[:, :, 0]
+            self._columns[text] = self.scan.values(forms.columns_of([text], self.sensor), of_samples=True)[:, :, 0]
         return self._columns[text]
 
     def columns(self, form: Form) -> Values:
         """Return the values of a form's columns: (n, 1, r) or (n, 3, r) array."""
-        columns = np.stack([self.column(text) for text in form.factor.texts], axis=-1)
+        texts = form.factor.texts
+        columns = (
+            np.stack([self.column(text) for text in texts], axis=-1) if texts[1:] else self.column(texts[0])[:, :, None]
+        )
         return columns * self.column(form.modulator.texts[0])[:, :, None] if form.modulator else columns
 
     def gains(self, tried: Sequence[Form], *, coarse: bool = False) -> list[FormGain]:

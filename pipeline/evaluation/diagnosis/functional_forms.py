@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 import scipy
 
-from pipeline.estimation.design import CURVE_DEGREE, true_motion
+from pipeline.estimation.design import CURVE_DEGREE, joined_motions, true_motion
 from pipeline.estimation.gauss_markov import WHITE_SETTING, GaussMarkov
 from pipeline.estimation.ranking import MIN_LEFT_SQUARE_SHARE, MIN_NEW_COLUMN_SHARE, UNIT_COLUMN_RIDGE
 from pipeline.evaluation.diagnosis.words import listed
@@ -401,6 +401,7 @@ class Scan:
         self.samples = 3.0 * observations.samples
         self.within = float(np.sum(observations.scatter / self.scale**2))
         self._motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]
+        self._joined = [motion for motion, _ in joined_motions(self._motions)]
         self._blocks, self._weight = observations.blocks, observations.weight
         self._label = self._blocks.label(len(self._weight))
         self._noise = GaussMarkov(self._blocks, [WHITE_SETTING, *selection.settings])
@@ -431,9 +432,12 @@ class Scan:
         self.left: Values = np.stack(left, axis=1)
         self.before = float(self.log_likelihood(self.left.sum(axis=1)).max())
 
-    def values(self, curves: Curves) -> Values:
-        """Return the values of curves in all rows: (n, 3, q) array, or (n, 1, q) if they are equal on all axes."""
-        return np.concatenate([curves(motion) for motion in self._motions])
+    def values(self, curves: Curves, *, of_samples: bool = False) -> Values:
+        """Return the values of curves in all rows: (n, 3, q) array, or (n, 1, q) if they are equal on all axes.
+
+        ``of_samples``: the values at a sample depend on the motion there alone.
+        """
+        return np.concatenate([curves(motion) for motion in (self._joined if of_samples else self._motions)])
 
     def whitened(self, columns: Values) -> Whitened:
         """Return (n, q) columns whitened."""
