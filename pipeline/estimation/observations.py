@@ -4,8 +4,10 @@ Of the samples whose readings and log are valid, a fit uses
 
 * those of settled rests, as means over at most 1 s. The motion does not change in a rest, so that only white noise is
   averaged; its sum of squares is stored.
-* those at which the log describes the motion. Where the log is too coarse for a ramp or a step, its angular
-  acceleration is wrong, which would bias a lever arm or a delay.
+* those at which the log describes the motion, as means over at most 0.5 deg, 1 s and 1/30 of the fastest rate: the rows
+  follow duration and motion, and not the sampling rate. The change of the motion within a row is subtracted before the
+  sum of squares. Where the log is too coarse for a ramp or a step, its angular acceleration is wrong, which would bias
+  a lever arm or a delay.
 
 If the readings were filtered, the motion is filtered, too. If the log has no rate, samples of a gyroscope are not used
 while the output of the filter depends on unknown rates.
@@ -25,7 +27,7 @@ from pipeline.estimation.gauss_markov import Blocks, constant_bias_s, informatio
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.estimation.turns import RowGroups, reference_valid, rows_of
 from pipeline.physics.effects import stated_priors
-from pipeline.physics.effects.base import turning_direction
+from pipeline.physics.effects.base import truth, turning_direction
 from pipeline.physics.kinematics import earth_of, table_motion
 from pipeline.physics.signal.encoder_rate import rate_by_angle
 from pipeline.physics.signal.filters import filtered, impulse_response
@@ -235,23 +237,36 @@ def _part(recording: Recording, sensor: str, motion: Motion) -> RecordingRows | 
         sure = _filter_settled(motion, recording) if sensor == "gyroscope" else reference_valid(motion)
         motion = replace(filtered_motion(_with_direction(motion), recording), reference_valid=sure)
     valid = np.logical_and(np.all(np.isfinite(reading), axis=1), recording.valid)
-    rows = rows_of(motion, valid, together=not filtered).settled(reading)
+    rows = rows_of(motion, valid, together=not filtered)
+    at_rest = _as_at_rest(sensor, motion, reading, rows)
+    rows = rows.settled(at_rest)
     if len(rows.first) == 0:
         return None
     independent = min(float(recording.filter.get("noise_gain", 1.0)) ** 2, 1.0)  # share of a filter's output
-    means = rows.means(reading)
-    squares = (reading[rows.kept] - np.repeat(means, rows.count.astype(int), axis=0)) ** 2
+    squares = (at_rest[rows.kept] - np.repeat(rows.means(at_rest), rows.count.astype(int), axis=0)) ** 2
     by_angle = rate_by_angle(recording) if sensor == "gyroscope" and recording.axis is not None else None
     return RecordingRows(
         recording.name,
         rows.motion(motion) if filtered else _motion_at(recording, motion, rows),
-        means,
+        rows.means(reading),
         weight=rows.count * independent,
         scatter=np.sum(squares, axis=0) * independent,
         clock_shared=recording.clock_shared,
         interval=recording.interval,
         rounding=None if by_angle is None or not by_angle.noise.any() else rows.means(by_angle.noise**2),
     )
+
+
+def _as_at_rest(sensor: str, motion: Motion, reading: Values, rows: RowGroups) -> Values:
+    """Return readings without their change by the motion within rows in motion, by a first fit."""
+    if np.all(rows.count[~motion.still[rows.kept[rows.first]]] == 1.0):
+        return reading
+    moving = np.flatnonzero(~motion.still)
+    u = np.column_stack([np.ones(len(moving)), truth(sensor, motion)[moving]])
+    used = np.isin(moving, rows.kept, assume_unique=True)
+    out = reading.copy()
+    out[moving] -= u @ np.linalg.lstsq(u[used], reading[moving[used]], rcond=None)[0]
+    return out
 
 
 @once_of_log
