@@ -205,17 +205,8 @@ MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 
 def check_recordings(recordings: Sequence[Recording], settings: Settings) -> list[Recording]:
     """Return the recordings of a unit, their turns by the convention, with notes on faults and corrections.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        In body axes, not filtered.
-    settings : Settings
-        Sections ``procedure``, ``sensor``, ``table`` and ``ingest``.
-
-    Raises
-    ------
-    InputError
-        If the recordings contradict each other, or the table's log contradicts itself or gravity.
+    ``recordings``: in body axes, not filtered. Raises ``InputError`` if the recordings contradict each other, or the
+    table's log contradicts itself or gravity.
     """
     _check_shared_rows(recordings)
     check_axes(recordings)

@@ -93,20 +93,14 @@ class ChannelLimits:
 class Channel:
     """The rotation by a channel of the table (``table_rate``, ``table_angle``, ``table_attitude``) or a sensor.
 
-    Attributes
-    ----------
-    low, high : (m,) array, deg/s
-        The rate at the samples (m = n) or over the intervals between them (m = n - 1); infinite where it is unknown.
-    turned : (n - 1,) array, deg
-        Angle turned in each interval; 0 where it is unknown.
-    noise : float, deg/s
+    ``low``, ``high``: (m,), rate at the n samples or over the n - 1 intervals, infinite where it is unknown.
     """
 
     name: str
-    low: Values
+    low: Values  # deg/s
     high: Values
-    turned: Values
-    noise: float
+    turned: Values  # (n - 1,), deg in each interval; 0 where it is unknown
+    noise: float  # deg/s
 
     @property
     def of_intervals(self) -> bool:

@@ -42,15 +42,7 @@ _flushed_at_end: list[Path] = []  # folders whose files are flushed together
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file under a temporary name in its folder, flush it to the disk, then rename it.
-
-    Parameters
-    ----------
-    path : Path
-        Its folder is created if it does not exist.
-    content : str or bytes
-        Text is written as UTF-8; line ends are not changed.
-    """
+    """Write a file under a temporary name in its folder, which is created, flush it to the disk, then rename it."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         stream = temporary.open("wb")

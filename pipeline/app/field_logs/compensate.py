@@ -63,9 +63,8 @@ def compensate_log(
     the readings with the suffix ``_calibrated``. ``smoothing``: memory of the regression line through past
     temperatures, s; 0 uses the temperature unchanged. ``rest``: an interval with a rest, s from the first sample; its
     mean rate is subtracted from the gyroscope. ``strict``: whether to refuse samples beyond the soaked temperatures.
-    ``progress`` is called with the numbers of finished samples and of read
-    bytes. Raises ``InputError``, without an output, if the log is damaged, contradicts the profile, has no rest in the
-    interval ``rest``, or would be overwritten.
+    ``progress`` is called with the numbers of finished samples and of read bytes. Raises ``InputError``, without an
+    output, if the log is damaged, contradicts the profile, has no rest in that interval, or would be overwritten.
     """
     files, profile, suffix = [source, *joined], profile or LogProfile(), source.suffix.lower()
     for file in files:

@@ -94,7 +94,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
 
 
 def plain(name: str) -> str:
-    """Return the name of an effect or covariate with blanks: ``bias temperature`` for ``bias_temperature``."""
+    """Return the name of an effect, verdict or setting with blanks: ``bias temperature`` for ``bias_temperature``."""
     return name.replace("_", " ")
 
 

@@ -175,14 +175,8 @@ ORDER = 4  # coefficients of a polynomial of third order in the temperature
 class ExportedSensor:
     """A calibrated sensor in the unit of a format.
 
-    Attributes
-    ----------
-    effects : dict of str to array
-        Values of the effects that the sensor causes.
-    bench_effects : list of str
-        Effects of mounting, place, recording, table and timing, which no export contains.
-    counts : float or None
-        Counts per g or deg/s.
+    ``effects``: values of those that the sensor causes. ``bench_effects``: names of those of mounting, place,
+    recording, table and timing, which no export contains. ``counts``: per g or deg/s, or None.
     """
 
     def __init__(self, calibration: SensorCalibration, unit: str, sheet: SensorFigures | None) -> None:

@@ -15,10 +15,11 @@ import pandas as pd
 
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Values
 from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, problems, state_of
+from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.outcome import all_well, beyond_limits_groups, command_of, counts_of, explain_command, ratio_words
 from pipeline.output.pages.chart import Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
 from pipeline.output.pages.fleet import parameter_table, wide
-from pipeline.output.pages.pages import Scale, number, percent, plain, scale_of, script_data, template, unit_text
+from pipeline.output.pages.pages import Scale, number, percent, scale_of, script_data, template, unit_text
 from pipeline.output.pages.parameters import SUMMARY_COLUMNS
 
 if TYPE_CHECKING:

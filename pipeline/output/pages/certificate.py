@@ -21,9 +21,10 @@ from markupsafe import Markup
 
 from pipeline.core.records import AXES, SENSORS
 from pipeline.core.verdicts import KINDS, Verdict, error_of
+from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.outcome import run_command
 from pipeline.output.pages.held_out_section import first_and_last_step
-from pipeline.output.pages.pages import number, plain, template
+from pipeline.output.pages.pages import number, template
 from pipeline.output.pages.parameters import fitted_parameters, reading_errors
 from pipeline.output.pages.unit_page import files_read
 from pipeline.physics.calibration_file import beyond_uncertainty, frame_words

@@ -39,11 +39,12 @@ import pyarrow.parquet as pq
 
 from pipeline.core.files import JSON, spreadsheet_cell, write_atomically
 from pipeline.core.records import MEDIAN_SIZE, SENSOR_UNITS, SENSORS
+from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.history import difference, dropped, errors_of, of_units
 from pipeline.output.outcome import add_command, uncertainty_words
 from pipeline.output.pages.chart import Figure
 from pipeline.output.pages.group_charts import Point, bars
-from pipeline.output.pages.pages import number, plain, template
+from pipeline.output.pages.pages import number, template
 from pipeline.output.pages.parameters import PARAMETER_KEYS, SUMMARY_COLUMNS
 
 if TYPE_CHECKING:

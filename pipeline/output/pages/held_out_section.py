@@ -18,6 +18,7 @@ import numpy as np
 from pipeline.core.records import AXES, SENSOR_UNITS, SENSORS, Noise, Recording, SensorCalibration, Values
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S
 from pipeline.estimation.noise_terms import TERM_UNITS, allan_variance
+from pipeline.evaluation.diagnosis.words import plain
 from pipeline.evaluation.held_out.error_breakdown import with_known_effects
 from pipeline.evaluation.held_out.samples import OTHER_SENSOR, samples_of_motion
 from pipeline.output.pages.chart import (
@@ -33,7 +34,7 @@ from pipeline.output.pages.chart import (
     sentences,
 )
 from pipeline.output.pages.group_charts import Point, bars
-from pipeline.output.pages.pages import number, percent, plain
+from pipeline.output.pages.pages import number, percent
 
 if TYPE_CHECKING:
     from pipeline.core.files import JSON

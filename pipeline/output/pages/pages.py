@@ -21,6 +21,7 @@ from markupsafe import Markup
 from pipeline.core.compiled_templates import CompiledTemplates
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import is_fixed
+from pipeline.evaluation.diagnosis.words import plain
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping, Sequence
@@ -136,11 +137,6 @@ def typeset(sentence: str) -> str:
     for ascii_text, sign in TYPOGRAPHIC.items():
         sentence = sentence.replace(ascii_text, sign)
     return re.sub(r"(?<![\w.-])-(?=\d)|(?<=\de)-(?=\d)", MINUS, sentence)
-
-
-def plain(name: str) -> str:
-    """Return the name of an effect, a verdict or a setting with spaces."""
-    return name.replace("_", " ")
 
 
 def unit_text(unit: object) -> str:

@@ -33,8 +33,8 @@ from pipeline.core.records import (
 )
 from pipeline.core.verdicts import Verdict, error_of
 from pipeline.estimation.candidates import is_fixed
+from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.pages.held_out_section import first_and_last_step, passes
-from pipeline.output.pages.pages import plain
 from pipeline.physics.calibration_file import (
     beyond_uncertainty,
     both_figures,

@@ -41,6 +41,7 @@ from pipeline.core.records import (
 )
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW, min_delta_bic
 from pipeline.estimation.posterior import prior_limit
+from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.pages.chart import (
     AXES_LEGEND,
     Area,
@@ -54,7 +55,7 @@ from pipeline.output.pages.chart import (
     sentences,
 )
 from pipeline.output.pages.group_charts import Point, bars, stems
-from pipeline.output.pages.pages import measured, number, percent, plain, unit_text
+from pipeline.output.pages.pages import measured, number, percent, unit_text
 from pipeline.physics.effects import catalogue
 from pipeline.physics.effects.base import largest_by_unit, parameter_limits
 from pipeline.physics.kinematics import table_motion
