@@ -47,7 +47,8 @@ CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and 
 SLOWEST = 1.0  # deg/s rms of a table: below, noise and bias wander are larger
 LARGEST_RESIDUAL = 0.3  # rms of the rates after the fit of the table's rate, of before: misalignment and noise
 CLOSE_BY_TURNS = 0.2  # bias and scale factor of both sensors, in few moves
-USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)  # 2, 4, 8, 16 g in 16 bits, and 12 or 10 bits
+# 2, 4, 8, 16 g in 16 bits, and 12 or 10 bits; Empatica's E4 has 8 bits.
+USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0, 64.0)
 # 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch); whole mdps (drivers of STMicroelectronics).
 USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2, 1000.0)
 LARGEST_COUNT = 2.0**23  # of converters with 24 bits
