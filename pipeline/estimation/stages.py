@@ -284,7 +284,8 @@ def fit_stage(
     if stage == GIVEN:
         return given_calibration(sensor, settings.method)
     check_stages(sensor, [*declarations(previous), stage] if previous else [stage])
-    module, of_both = import_module(stage_module(sensor, stage)), len(declared(sensor, stage).sensors) > 1
+    module = import_module(stage_module(sensor, stage))
+    of_both = len(declared(sensor, stage).sensors) > 1 and f".{sensor}." not in module.__name__
     fit = partial(module.fit, *((stage,) if len(module.FIT_STAGES) > 1 else (sensor,) if of_both else ()))
     for other in SENSORS:
         if other != sensor and (of_other := known_effects(other, settings.method)):
