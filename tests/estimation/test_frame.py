@@ -6,8 +6,8 @@ from unit_settings import settings_of
 
 from pipeline.app.steps.calibration import frame_uncertainty
 from pipeline.core.records import FittedEffect, Recording, SensorCalibration
-from pipeline.physics.calibration_file import OF_FRAME, beyond_uncertainty, frame_words
 from pipeline.physics.kinematics import turn_by_vector
+from pipeline.physics.statements import OF_FRAME, beyond_uncertainty, frame_words
 
 NORMAL = 1.959964
 

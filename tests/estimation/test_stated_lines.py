@@ -22,7 +22,7 @@ from pipeline.estimation import reference_least_squares
 from pipeline.estimation.stated_lines import with_stated
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.ingest.arrow import to_parquet
-from pipeline.physics.calibration_file import beyond_uncertainty
+from pipeline.physics.statements import beyond_uncertainty
 from pipeline.unit import STEPS
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from pipeline.checks.checks import check_recordings
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.ingest.read import read_recordings
 from pipeline.output.pages.campaign_page import render
-from pipeline.physics.calibration_file import left_out
+from pipeline.physics.statements import left_out
 
 if TYPE_CHECKING:
     from pipeline.core.records import Recording

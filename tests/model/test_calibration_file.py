@@ -12,7 +12,8 @@ from scipy.signal import lfilter
 from pipeline.app.steps.calibration import calibrated_range, judged
 from pipeline.core.records import FittedEffect, Recording, SensorCalibration
 from pipeline.ingest.quality_flags import CLIPPED
-from pipeline.physics.calibration_file import implausible, sample_covariance, sentences
+from pipeline.physics.calibration_file import sample_covariance
+from pipeline.physics.statements import implausible, sentences
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.records import Budget, NotIncluded, SensorCalibration
-from pipeline.physics.calibration_file import both_figures, open_words, with_open
+from pipeline.physics.statements import both_figures, open_words, with_open
 
 U_BIAS = 1e-3 * 1.959964
 CALIBRATION = SensorCalibration(

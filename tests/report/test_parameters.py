@@ -8,7 +8,7 @@ from unit_settings import sheet_of
 from pipeline.core.records import FittedEffect, SensorCalibration
 from pipeline.output.pages.comparison import unit_figures
 from pipeline.output.pages.parameters import fitted_parameters, parameter_rows, reading_errors, sensor_errors
-from pipeline.physics.calibration_file import beyond_limits, beyond_words
+from pipeline.physics.statements import beyond_limits, beyond_words
 
 
 def part_with_unequal_freedom() -> dict:

@@ -13,7 +13,7 @@ from unit_settings import settings_of
 from pipeline.output.pages.campaign_page import ENDS, strips
 from pipeline.output.pages.fleet import parameter_table
 from pipeline.output.pages.parameters import unit_parameters
-from pipeline.physics.calibration_file import beyond_limits
+from pipeline.physics.statements import beyond_limits
 
 if TYPE_CHECKING:
     import pandas as pd

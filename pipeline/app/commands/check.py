@@ -29,7 +29,7 @@ from pipeline.core.records import SENSORS
 from pipeline.core.settings import Ingest, settings_of_ranges
 from pipeline.ingest.files import FILE, recording_files
 from pipeline.output.outcome import NAMED_PER_LINE, as_overrides, found_mountings
-from pipeline.physics.calibration_file import LEFT_OUT_REASONS
+from pipeline.physics.statements import LEFT_OUT_REASONS
 
 if TYPE_CHECKING:
     import argparse

@@ -34,7 +34,7 @@ from pipeline.output.outcome import (
     read_summary,
 )
 from pipeline.output.pages.pages import template
-from pipeline.physics.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
+from pipeline.physics.statements import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

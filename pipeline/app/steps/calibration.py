@@ -46,7 +46,7 @@ from pipeline.estimation.chips import chip_document
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.ingest.axis_maps import axis_maps
 from pipeline.ingest.quality_flags import GAP
-from pipeline.physics.calibration_file import beyond_limits, implausible, not_determined, with_open
+from pipeline.physics.statements import beyond_limits, implausible, not_determined, with_open
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -66,11 +66,11 @@ from pipeline.evaluation.diagnosis.words import plain
 from pipeline.evaluation.held_out.error_breakdown import last_step
 from pipeline.evaluation.held_out.heldout import last_error, static_error
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, samples_of_motion
-from pipeline.physics.calibration_file import not_determined
 from pipeline.physics.effects import catalogue, effect, effect_of
 from pipeline.physics.effects.base import parameter_limits, truth, unit_of
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.measurement import linear_truth
+from pipeline.physics.statements import not_determined
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -27,7 +27,7 @@ from pipeline.output.pages.held_out_section import first_and_last_step
 from pipeline.output.pages.pages import number, template
 from pipeline.output.pages.parameters import fitted_parameters, reading_errors
 from pipeline.output.pages.unit_page import files_read
-from pipeline.physics.calibration_file import beyond_uncertainty, frame_words
+from pipeline.physics.statements import beyond_uncertainty, frame_words
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -35,13 +35,7 @@ from pipeline.core.verdicts import Verdict, error_of
 from pipeline.estimation.candidates import is_fixed
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.pages.held_out_section import first_and_last_step, passes
-from pipeline.physics.calibration_file import (
-    beyond_uncertainty,
-    both_figures,
-    left_out,
-    limited_effects,
-    without_rotation,
-)
+from pipeline.physics.statements import beyond_uncertainty, both_figures, left_out, limited_effects, without_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Callable

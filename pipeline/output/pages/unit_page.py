@@ -38,8 +38,8 @@ from pipeline.output.pages.residual_section import (
     unexplained,
     upper_limits,
 )
-from pipeline.physics.calibration_file import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 from pipeline.physics.signal.rests import Rest, rests_from_table
+from pipeline.physics.statements import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -23,8 +23,8 @@ from pipeline.estimation.multi_position.fit import SMALL_LAST_STEP
 from pipeline.estimation.multi_position.fit import fit as fit_model
 from pipeline.estimation.multi_position.model import State, prior_hypotheses
 from pipeline.estimation.rest_means import gathered, held_out_rests, rest_means
-from pipeline.physics.calibration_file import not_determined
 from pipeline.physics.signal.rests import Rest
+from pipeline.physics.statements import not_determined
 
 if TYPE_CHECKING:
     from pipeline.core.settings import Settings

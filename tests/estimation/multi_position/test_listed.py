@@ -14,8 +14,8 @@ import pipeline
 from pipeline.app.field_logs.compensate import compensate_log
 from pipeline.core.errors import InputError, NotObservableError
 from pipeline.core.records import SensorCalibration
-from pipeline.physics.calibration_file import not_determined
 from pipeline.physics.compensation import load
+from pipeline.physics.statements import not_determined
 from tests.study.listed_recordings import Unit, at_rest, joined, on_table, run, table, turned
 
 if TYPE_CHECKING:
