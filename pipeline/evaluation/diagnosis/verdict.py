@@ -234,7 +234,7 @@ def _made_worse(held_out: SelectionErrors | None) -> bool:
 # calibration is above its interval.
 RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
     (Verdict.REFERENCE_IN_DOUBT, "doubts", lambda e: e.doubts),
-    (Verdict.MISSING_EFFECT, "beyond", lambda e: e.above and e.missing and not (e.full and e.full.above)),
+    (Verdict.MISSING_EFFECT, "missing", lambda e: e.above and e.missing and not (e.full and e.full.above)),
     (Verdict.UNEXPLAINED, "above_and_unexplained", lambda e: e.above and e.unexplained),
     (Verdict.LEFT_BY_METHOD, "above_by_method", lambda e: e.above and e.of_method),
     (Verdict.REFERENCE_IN_DOUBT, "static", lambda e: e.static_differs),
@@ -244,7 +244,7 @@ RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
     (Verdict.UNEXPLAINED, "moves", lambda e: e.moves and e.moves.rms_deg > e.moves.largest_deg and not e.missing),
     (Verdict.UNEXPLAINED, "far_moves", lambda e: e.moves and e.moves.over_noise > MAX_OVER_NOISE and not e.missing),
     (Verdict.UNEXPLAINED, "scatter", lambda e: e.scatter > MAX_SCATTER_BY_HAND and not e.missing),
-    (Verdict.MISSING_EFFECT, "beyond", lambda e: e.missing),
+    (Verdict.MISSING_EFFECT, "missing", lambda e: e.missing),
     (Verdict.REFERENCE_IN_DOUBT, "disagreement", lambda e: e.disagrees),
     (Verdict.FLOOR_IN_DOUBT, "below", lambda e: e.published and e.published.below),
     (Verdict.FLOOR_IN_DOUBT, "too_quiet", lambda e: e.too_quiet),

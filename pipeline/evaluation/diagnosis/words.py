@@ -31,6 +31,12 @@ UNKNOWN = {
     "angle": "turn again with the unit remounted at another angle: errors of the table stay at the same table angles",
     "specific_force": "record rests in which all three axes are inclined, and more than 1 g if you can",
 }
+LAG, HYSTERESIS = "temperature_lag", "temperature_hysteresis"  # covariates: of a soak that heats and cools
+IN_WORDS = {
+    LAG: "the rate of the temperature (a thermometer that lags behind the sensor, or before it)",
+    HYSTERESIS: "heating or cooling (hysteresis)",
+}
+UNKNOWN |= dict.fromkeys(IN_WORDS, "heat and cool at half the rate: an error by lag halves, one by hysteresis stays")
 FAR_OFF = (
     "check the table against its log first (steps, backlash, rate, vibration) and the mounting: the residual is far "
     "above the noise and does not depend on any recorded quantity"
@@ -56,7 +62,12 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {"plain": plain, "listed": listed, "said": lambda answer: _said(Answer(**answer))}
-    environment.globals |= {"is_fixed": is_fixed, "largest_by_unit": largest_by_unit, "plus_minus": PLUS_MINUS}
+    environment.globals |= {
+        "is_fixed": is_fixed,
+        "heating_and_cooling": tuple(IN_WORDS),
+        "largest_by_unit": largest_by_unit,
+        "plus_minus": PLUS_MINUS,
+    }
     environment.globals |= {"stays": STAYS, "unchanged": UNCHANGED, "Verdict": Verdict}
     return environment
 
@@ -94,8 +105,8 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
 
 
 def plain(name: str) -> str:
-    """Return the name of an effect, verdict or setting with blanks: ``bias temperature`` for ``bias_temperature``."""
-    return name.replace("_", " ")
+    """Return the name of an effect, verdict, setting or covariate in words: ``bias temperature``."""
+    return IN_WORDS.get(name) or name.replace("_", " ")
 
 
 def listed(words: Sequence[str], conjunction: str = "and") -> str:
@@ -138,4 +149,6 @@ def of_unknown(unknown: Sequence[Dependence], *, on_table: bool) -> str:
     if not unknown:
         return FAR_OFF if on_table else UNSTEADY
     covariate = unknown[0].covariate
+    if covariate in IN_WORDS:
+        return UNKNOWN[covariate]
     return f"to find other quantities than {plain(covariate)} on which the residual depends: {UNKNOWN[covariate]}"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+import scipy
 
 import pipeline
 from pipeline.app.field_logs.compensate import compensate_log
@@ -253,6 +254,30 @@ def test_a_soak_shows_bias_over_temperature_to_the_third_power(tmp_path: Path) -
     assert steps[-1]["rms_error"] < 0.01
     assert steps[0]["rms_error"] > 1.0
     assert result.calibration["calibrated_range"]["temperature_degc"] == pytest.approx([-15.0, 65.0], abs=0.5)
+
+
+# A die that follows the thermometer with a time constant, s; a bias that differs between heating and cooling, deg/s.
+@pytest.mark.parametrize(
+    ("lag", "loop", "named"),
+    [(0.0, 0.0, []), (60.0, 0.0, ["temperature_lag"]), (0.0, 0.05, ["temperature_hysteresis"])],
+)
+def test_a_soak_that_heats_and_cools_shows_lag_and_hysteresis(
+    tmp_path: Path, lag: float, loop: float, named: list[str]
+) -> None:
+    rng, n = np.random.default_rng(14), 5400
+    time, keep = np.arange(n) / 1.0, np.exp(-1.0 / lag) if lag else 0.0
+    warm = 30.0 * np.sin(2.0 * np.pi * time / n)
+    die = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], warm)
+    heats = np.tanh(np.gradient(die) / 0.005)
+    gyro = np.outer(die, [0.01, -0.02, 0.03]) + loop * np.outer(heats, [1.0, -1.0, 1.0]) + [0.5, -1.0, 2.0]
+    table_ = np.column_stack([time, gyro + 5e-3 * np.sqrt(0.5) * rng.normal(size=(n, 3)), 25.0 + warm])
+    header = "time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,temperature_degc"
+    np.savetxt(tmp_path / "soak.csv", table_, fmt="%.8g", delimiter=",", header=header, comments="")
+    (tmp_path / "recordings.csv").write_text("file,kind\nsoak.csv,soak\n")
+    diagnosis = calibrated(tmp_path, "effects.gyroscope=auto").diagnosis["gyroscope"]
+    assert [each["covariate"] for each in diagnosis["unexplained"]] == named
+    words = {"temperature_lag": "a thermometer that lags", "temperature_hysteresis": "heating or cooling (hysteresis)"}
+    assert all(words[name] in diagnosis["reason"] for name in named)
 
 
 def test_rows_beyond_the_soaked_temperatures_are_marked_or_refused(tmp_path: Path) -> None:
