@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.output.pages.chart import (
+    LEFT,
     Area,
     Axis,
     Dots,
@@ -122,7 +123,7 @@ def test_few_samples_are_dots_at_their_values(*, hole: bool) -> None:
     if hole:
         block[7, 1] = np.nan
     svg = chart(FIGURE, "d", [Panel([SampleMarks(x, block)], "y", height=100, limits=(-5.0, 5.0))], "x").svg
-    across, up = Axis(x[0], x[-1], 64, 406), Axis(-5.0, 5.0, 108, 8)
+    across, up = Axis(x[0], x[-1], LEFT, 406), Axis(-5.0, 5.0, 108, 8)
     for column, path in zip(block.T, drawn(svg, "dots"), strict=True):
         known = np.isfinite(column)
         assert points(path) == list(zip(across.units(x[known]).tolist(), up.units(column[known]).tolist(), strict=True))
@@ -146,8 +147,8 @@ def test_an_interval_and_a_band_are_drawn_at_their_ends() -> None:
     at = np.array([1.0, 2.0])
     layers = [Area(-0.5, 0.5), Dots(at, at - 1.5, 0, at - 1.6, at - 1.4)]
     svg = chart(FIGURE, "d", [Panel(layers, "y", height=100, limits=(-1.0, 1.0))], "x").svg
-    assert drawn(svg, "band") == ["M640 830l3420 0 0 -500 -3420 0z"]
-    assert drawn(svg, "strokes") == ["M640 880V780M4060 380V280"]
+    assert drawn(svg, "band") == ["M720 830l3340 0 0 -500 -3340 0z"]
+    assert drawn(svg, "strokes") == ["M720 880V780M4060 380V280"]
 
 
 def test_the_values_that_a_zoom_draws_end_at_the_limits_of_the_panel() -> None:

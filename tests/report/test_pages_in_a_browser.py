@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from pipeline.output.pages import campaign_page, unit_page
-from pipeline.output.pages.chart import Figure, LineMark, Panel, SampleMarks, chart
+from pipeline.output.pages.chart import CHART_WIDTH, LEFT, RIGHT, Figure, LineMark, Panel, SampleMarks, chart
 from pipeline.output.pages.fleet import runs_data
 from pipeline.output.pages.pages import asset
 
@@ -20,6 +20,17 @@ from .conftest import build_unit
 
 UNITS = 1200
 FAILED = UNITS // 200
+WIDTH = CHART_WIDTH - LEFT - RIGHT  # of the panels of a chart
+TEXTS = """charts => charts.flatMap((svg) => {
+  const box = svg.getBoundingClientRect();
+  const all = [...svg.querySelectorAll("text")].map((e) => [e.textContent, e.getBoundingClientRect()]);
+  const [ticks, names] = [".panel > .ticks text", ".panel > text[transform]"].map((selector) =>
+    [...svg.querySelectorAll(selector)].map((e) => [e.textContent, e.getBoundingClientRect()]));
+  const across = (a, b) => Math.min(a.right, b.right) - Math.max(a.left, b.left) > 2
+    && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 4;
+  return [...all.filter(([, r]) => r.left < box.left - 2 || r.right > box.right + 2).map(([text]) => text),
+    ...ticks.flatMap(([text, a]) => names.filter(([, b]) => across(a, b)).map(([name]) => `${text} on ${name}`))];
+})"""  # texts of charts that are cut, and ticks on the name of their axis
 PHONE = {"width": 390, "height": 844}
 
 
@@ -367,7 +378,7 @@ def test_arrow_keys_and_pointer_read_the_values_that_were_drawn(browser: Browser
     page.locator("svg").blur()
     assert readout.is_hidden()
     box = page.locator("svg").bounding_box() or {}
-    page.mouse.move(box["x"] + box["width"] * (64 + 342 * 0.7) / 420, box["y"] + 60)
+    page.mouse.move(box["x"] + box["width"] * (LEFT + WIDTH * 0.7) / 420, box["y"] + 60)
     told = [float(v) for v in re.findall(r"[\d.]+", readout.text_content() or "")]
     assert told == pytest.approx([7.0, 20.0], abs=0.025)  # coordinates are drawn to a tenth of a pixel
     assert left_alone(page, pages / "chart.html")
@@ -382,7 +393,7 @@ def test_dragging_zooms_into_what_was_marked_and_escape_goes_back(browser: Brows
 
     before = labels()
     box = page.locator("svg").bounding_box() or {}
-    left, right = (box["x"] + box["width"] * (64 + 342 * share) / 420 for share in (0.395, 0.605))
+    left, right = (box["x"] + box["width"] * (LEFT + WIDTH * share) / 420 for share in (0.395, 0.605))
     page.mouse.move(left, box["y"] + 40)
     page.mouse.down()
     page.mouse.move(right, box["y"] + 42, steps=3)
@@ -407,7 +418,7 @@ def test_a_chart_moves_with_shift_and_is_saved_with_its_values(browser: Browser,
     page.keyboard.down("Shift")
     page.mouse.move(box["x"] + box["width"] * 0.5, box["y"] + 40)
     page.mouse.down()
-    page.mouse.move(box["x"] + box["width"] * (0.5 - 342 * 0.2 / 420), box["y"] + 40, steps=3)
+    page.mouse.move(box["x"] + box["width"] * (0.5 - WIDTH * 0.2 / 420), box["y"] + 40, steps=3)
     page.mouse.up()
     page.keyboard.up("Shift")
     after = page.eval_on_selector_all("svg > .ticks text", ticks)
@@ -527,12 +538,18 @@ def test_pages_fit_every_window_with_few_words_and_a_first_screen(browser: Brows
     page.goto((pages / "unit.html").as_uri())
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     assert len(page.inner_text("body").split()) < 1200
+    if width == 1300:
+        assert page.evaluate("document.documentElement.scrollHeight") < 3500
     clipped = (
         """all => all.filter((e) => e.checkVisibility() && e.scrollWidth > e.clientWidth + 1).map((e) => e.outerHTML)"""
     )
     assert page.eval_on_selector_all(".card .scroll, figure, .big", clipped) == []
-    if width == 1300:
-        assert page.evaluate("document.documentElement.scrollHeight") < 3500
+    page.evaluate("document.querySelectorAll('details').forEach((part) => part.open = true)")
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    assert page.eval_on_selector_all("svg.chart", TEXTS) == []
+    unreached = "all => all.filter((e) => e.scrollWidth > e.clientWidth && e.tabIndex !== 0).map((e) => e.innerText)"
+    assert page.eval_on_selector_all(".scroll", unreached) == []  # by keys
+    assert page.locator("th:empty").count() == 0
     page.context.close()
 
 

@@ -71,6 +71,8 @@ def test_each_dot_stands_at_its_share_of_the_limit_and_tells_its_value() -> None
         value = float(re.findall(r"[\d.]+(?:e-\d+)?", text.split(": ")[1].replace("−", "-"))[0])
         limit = float(text.rpartition("±")[2])
         assert 100.0 * value / limit == pytest.approx(abs(true), rel=2e-3)
+    (start,) = set(re.findall(r'data-scale="[^,]*,[^,]*,(\d+),[^"]*%"', figure.svg))
+    assert int(start) > 6 * max(map(len, NAMES))  # px: the longest name is not cut
     beyond = (np.abs(np.delete(shares, 2, 0)) > 1.0).any(axis=1).sum()
     assert f"{beyond} of 6 units are outside the data sheet's limits" in figure.finding
 

@@ -74,7 +74,9 @@ def render(
         for column, figure in (("error_before", "before"), ("error_after", "after"), ("noise_floor", "floor")):
             frame[f"{sensor}_{column}"] = [getattr(state.errors[sensor], figure) for state in states]
     judged = [row.get("pass") for row in rows]
-    serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
+    serials: dict[str, list[JSON]] = {}  # a loop: pandas takes as long for a group of one as for a large one
+    for row in rows:
+        serials.setdefault(str(row.get("serial") or ""), []).append(row)
     fleet = [unit_chart for sensor in SENSORS if (unit_chart := _fleet_figure(sensor, frame))]
     overview = [unit_chart for sensor in SENSORS if (unit_chart := overview_chart(sensor, states))]
     fitted = parameter_table({}) if parameters is None else parameters
@@ -99,7 +101,7 @@ def render(
         judged=any(row.get("pass") is not None for row in rows if row["status"] == "ok"),
         fleet=_medians("all units", frame),
         lots=_lots(frame),
-        groups=[(f"Serial {n}", [rows[i] for i in same.index]) for n, same in serials if len(same) > 1],
+        groups=[(f"Serial {n}", same) for n, same in serials.items() if n and len(same) > 1],
         most_groups=MOST_GROUPS,
         figures=[figure for figure, _ in fleet],
         statistics=statistics if statistics and len(rows) >= FEWEST_UNITS else None,
@@ -375,7 +377,8 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
     figure = Figure(name, finding, caption, tuple(legend))
     panel = Panel([*layers, *dots], "", ROW * len(labels), limits=(0.4, height[0] + 0.6), rows=labels[::-1])
     label = "share of the data sheet's limit, %"
-    return chart(figure, description, [panel], label, margin=0.03, left=LEFT, units="units"), values
+    left = max(LEFT, round(NAME_LETTER * max(map(len, labels))) + 10)
+    return chart(figure, description, [panel], label, margin=0.03, left=left, units="units"), values
 
 
 def _bar(ends: Values, low: float, high: float, colour: int) -> ChartLayer:

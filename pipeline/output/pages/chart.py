@@ -153,7 +153,7 @@ class Axis:
 
 AXES_LEGEND = (("c0", "x"), ("c1", "y"), ("c2", "z"))
 CHART_WIDTH = 420  # px, of the drawing; the page scales it
-LEFT, RIGHT, TOP, BOTTOM, PANEL_GAP = 64, 14, 8, 36, 14  # px, margins of the panels and the gap between two
+LEFT, RIGHT, TOP, BOTTOM, PANEL_GAP = 72, 14, 8, 36, 14  # px, margins of the panels and the gap between two
 UPRIGHT = 28  # px, of height for each tick of axis y
 MAXIMUM_DOTS = 240  # samples drawn as dots; about one in 1.4 px
 BUCKETS = 140  # ranges drawn for more samples; about one in 2.4 px
@@ -331,7 +331,7 @@ def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
     return (
         f'<g class="panel"{y.attribute(panel.label, panel.rows)}><path class="grid" d="{grid}"/>'
         f'<g class="ticks">{labels}</g>'
-        f'<text class="m" transform="translate(10 {middle:g}) rotate(-90)">{escape(typeset(panel.label))}</text>'
+        f'<text class="m" transform="translate(12 {middle:g}) rotate(-90)">{escape(typeset(panel.label))}</text>'
         f'<g class="layers" transform="scale({1 / SUBDIVISION:g})">{drawn}</g>{names}</g>'
     )
 

@@ -79,6 +79,7 @@ const fit = new ResizeObserver((entries) => requestAnimationFrame(() => {
     table.classList.remove("folded");
     const column = [...table.rows].some((row) => row.offsetHeight > 200); // of a word a line
     table.classList.toggle("folded", narrow.matches && (column || target.scrollWidth > target.clientWidth + 1));
+    if (!target.matches(".tall")) target.scrollWidth > target.clientWidth ? target.tabIndex = 0 : target.removeAttribute("tabindex"); // scrolled by keys
   }
 }));
 document.querySelectorAll(".scroll").forEach((box, i) => {
