@@ -91,7 +91,7 @@ def tutorial(browser: Browser, folder: Path) -> None:
     figures(browser, page, "tutorial_behind_the_first.png", "gyroscope-ranking", "gyroscope-added-variable")
     (campaign / "effects" / "die_stress.yaml").write_text(re.sub(r"(?m)^name: .*", "name: die_stress", form))
     run(folder / "results", campaign, "overrides=effects.gyroscope=[g_sensitivity, bias_temperature, die_stress]")
-    figures(browser, page, "tutorial_ladder.png", "gyroscope-staircase-magnitude", "gyroscope-staircase-vector")
+    figures(browser, page, "tutorial_ladder.png", "gyroscope-staircase-vector")
 
 
 def demo(browser: Browser, folder: Path) -> None:
