@@ -1,7 +1,7 @@
 """Guess the units of the numbers in an unknown log from its motion, each with its evidence (``imu_logs.guesses``).
 
 specific force : |f| at rest is 1 in g, 9.8 in m/s^2, 1000 in mg; in counts, it is the number of counts per g
-angular rate   : the unit in which the integrated rates rotate gravity from rest to rest (``gravity_rotation``)
+angular rate   : the unit in which the integrated rates rotate gravity from rest to rest (``axis_maps``)
 encoder        : gravity turns with the table, f = c + a cos(2 pi n / N) + b sin(2 pi n / N), with N counts per turn,
                  360 for degrees; about a vertical shaft, the gyroscope determines N to within its scale factor
 """

@@ -14,7 +14,7 @@ D   : (n, n) covariance by errors of the direction of gravity at each rest, as l
 H   : (n, 3 t) derivatives with respect to the bias of each axis in each of t stretches of time, over its white noise
 R   : (t, t) covariance of a Gauss-Markov bias of unit variance, averaged over each stretch
 q   : standard deviation of that bias over white noise
-k   : at least 1: scatter beyond the hypotheses of a grid (``likelihood``)
+k   : at least 1: scatter beyond the hypotheses of a grid (``fit``)
 
 A parameter that the recordings do not determine has a separate equation, a pseudo-observation of the value of an ideal
 sensor with the standard uncertainty u by the sensor file's limit. ``between`` is the standard
