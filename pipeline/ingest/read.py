@@ -27,7 +27,6 @@ import numpy as np
 
 import imu_logs
 from imu_logs.profile import TIME, checks_of, csv_formats
-from imu_logs.text_read import read_csv
 from imu_logs.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError, MissingInputError
 from pipeline.core.records import (
@@ -42,8 +41,9 @@ from pipeline.core.records import (
 from pipeline.ingest.axis_maps import STRAIGHT, axis_maps, axis_matrix, in_body_axes, map_of_orientation
 from pipeline.ingest.clock_alignment import unwrapped
 from pipeline.ingest.disturbances import leave_out_disturbances, leave_out_shaken_rests
-from pipeline.ingest.files import candidate_files, require_recordings
+from pipeline.ingest.files import candidate_files
 from pipeline.ingest.quality_flags import examine
+from pipeline.ingest.recordings_sheet import require_recordings
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -288,6 +288,8 @@ def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, che
     if path.suffix.lower() != ".csv" or len(layouts) != 1:
         raise IngestError("attitudes are read from one .csv; export them as text", str(path), code="foreign")
     columns = tuple(c for c in layouts[0].columns if c.channel != TIME)
+    from imu_logs.text_read import read_csv  # noqa: PLC0415  (pyarrow, for tables of means)
+
     table = read_csv(
         [path], [layouts[0].model_copy(update={"columns": columns, "rate_hz": 1.0 / BETWEEN_ROWS_S})], checks
     )

@@ -60,7 +60,8 @@ from pipeline.core.settings import (
 )
 from pipeline.core.user_cache import from_cache, to_cache
 from pipeline.estimation.stages import NOT_WANTED, check_stages, declared
-from pipeline.ingest.files import candidate_files, with_sheet
+from pipeline.ingest.files import candidate_files
+from pipeline.ingest.recordings_sheet import with_sheet
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
