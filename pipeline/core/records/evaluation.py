@@ -72,6 +72,17 @@ class LimitCheck:
 
 
 @dataclass(frozen=True)
+class Reduced:
+    """The best that a format holds of a calibration: a part of the matrix, and some of its effects."""
+
+    part: str  # of the matrix: full, diagonal, none
+    effects: Sequence[str]  # that it holds
+    bias: Sequence[float]
+    matrix: Sequence[Sequence[float]]
+    rms_error: float | None  # held-out, of the magnitude
+
+
+@dataclass(frozen=True)
 class SensorValidation:
     """A sensor's part of ``validations/<unit>.json``."""
 
@@ -90,6 +101,7 @@ class SensorValidation:
     agreement: Agreement | None = None
     over_temperature: OverTemperature | None = None  # only where the temperature was swept
     limits: tuple[LimitCheck, ...] = ()
+    reduced: tuple[Reduced, ...] = ()  # for formats that hold less
 
     @property
     def passes(self) -> bool | None:
@@ -122,6 +134,7 @@ class SensorValidation:
             "worse_than_raw": self.worse_than_raw,
             "agreement": self.agreement and dict(vars(self.agreement)),
             **({"over_temperature": bins} if bins else {}),
+            **({"reduced": [dict(vars(each)) for each in self.reduced]} if self.reduced else {}),
             "limits": [{"name": c.name, "limit": c.limit, "value": c.value, "pass": c.passes} for c in self.limits],
             "pass": self.passes,
         }
@@ -145,6 +158,7 @@ class SensorValidation:
             agreement=agreement and Agreement(**agreement),
             over_temperature=over
             and OverTemperature(over["samples_of"], tuple(TemperatureBin(**each) for each in over["bins"])),
+            reduced=tuple(Reduced(**each) for each in data.get("reduced", ())),
             limits=tuple(LimitCheck(c["name"], c["limit"], c["value"], c["pass"]) for c in data["limits"]),
             **{key: data[key] for key in KEYS_AS_THEY_ARE},
         )

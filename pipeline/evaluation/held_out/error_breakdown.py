@@ -127,6 +127,11 @@ def with_known_effects(calibration: SensorCalibration, samples: Samples) -> Corr
     return _with_effects(calibration, [fitted for fitted in calibration.effects if not _lack(fitted, samples)], samples)
 
 
+def rms_error_of(calibration: SensorCalibration, samples: Sequence[Samples]) -> float | None:
+    """Return the rms error of the magnitude with the effects that can be subtracted; None without samples."""
+    return _figures("", [with_known_effects(calibration, s) for s in samples])[1].rms_error if samples else None
+
+
 def _uncorrected(samples: Samples, readings: Values) -> Corrected:
     """Return readings, and the magnitude and vector of the reference without effects."""
     return readings, samples.magnitude, None if samples.motion is None else truth(samples.sensor, samples.motion)

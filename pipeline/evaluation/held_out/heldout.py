@@ -61,6 +61,7 @@ from pipeline.evaluation.held_out.error_breakdown import (
     left_out,
     linearized,
 )
+from pipeline.evaluation.held_out.reduced import reduced
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, reference_vector, squared_norm_errors
 from pipeline.ingest.quality_flags import STUCK
 from pipeline.physics.effects import bench_priors, effect_of
@@ -131,7 +132,8 @@ def validate(
             notes.append(
                 f"the expected error is not stated, because {', '.join(names)} {verb} left out of the held-out error"
             )
-        part = replace(part, notes=tuple(notes))
+        fitted = case.fit_samples() if part.held_out else samples
+        part = replace(part, notes=tuple(notes), reduced=tuple(reduced(calibration, fitted, samples)))
     return replace(part, limits=_check_limits(calibration, part.steps[-1], settings.limits.of(sensor)))
 
 

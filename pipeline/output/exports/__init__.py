@@ -35,7 +35,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from pipeline.core.compiled_templates import CompiledTemplates
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import JSON, Check, WrongValueError, each, fields, one_of
-from pipeline.core.records import SENSORS, FittedEffect, SensorCalibration
+from pipeline.core.records import SENSORS, FittedEffect, Reduced, SensorCalibration
 from pipeline.output.exports.sensors import (
     TEMPLATE_FUNCTIONS,
     UNIT_FACTORS,
@@ -159,7 +159,22 @@ class ExportedUnit:
     def sensors(self, declared: Format) -> dict[str, ExportedSensor]:
         """Return the calibrated sensors in the units of a format."""
         units = declared.units
-        return {s: ExportedSensor(c, units[s], self.sheets.get(s)) for s, c in self.calibrations.items() if s in units}
+        return {
+            s: ExportedSensor(c, units[s], self.sheets.get(s), self._held(c, declared))
+            for s, c in self.calibrations.items()
+            if s in units
+        }
+
+    def _held(self, calibration: SensorCalibration, declared: Format) -> Reduced | None:
+        """Return what a format holds of a calibration that it cannot hold; None where it does, or nothing is known."""
+        sensor = calibration.sensor
+        included = {*declared.effects, *declared.effects_in_part}
+        own = {e.name for e in sensor_effects(calibration)}
+        kept = own if "all" in included else own & included
+        for entry in ((self.validation or {}).get(sensor) or {}).get("reduced", ()):
+            if entry["part"] == declared.matrix.get(sensor, "full") and set(entry["effects"]) == kept:
+                return Reduced(**entry)
+        return None
 
 
 def exports(

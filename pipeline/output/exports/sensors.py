@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.core.files import JSON
-    from pipeline.core.records import SensorCalibration, Values
+    from pipeline.core.records import Reduced, SensorCalibration, Values
     from pipeline.core.settings import DataSheet
 
 UNIT_FACTORS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "deg/s": 1.0, "rad/s": float(np.pi / 180.0)}
@@ -177,14 +177,20 @@ class ExportedSensor:
     """A calibrated sensor in the unit of a format.
 
     ``effects``: values of those that the sensor causes. ``bench_effects``: names of those of mounting, place,
-    recording, table and timing, which no export contains. ``counts``: per g or deg/s, or None.
+    recording, table and timing, which no export contains. ``counts``: per g or deg/s, or None. ``held``: what a
+    format holds that holds less, fitted to the recordings; bias and matrix are then of it.
     """
 
-    def __init__(self, calibration: SensorCalibration, unit: str, sheet: SensorFigures | None) -> None:
+    def __init__(
+        self, calibration: SensorCalibration, unit: str, sheet: SensorFigures | None, held: Reduced | None = None
+    ) -> None:
         self.calibration, self.name, self.unit, self.sheet = calibration, calibration.sensor, unit, sheet
-        self.factor = UNIT_FACTORS[unit]
-        self.bias, self.matrix = calibration.bias * self.factor, calibration.matrix
-        self.K: Values = np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)))
+        self.factor, self.held = UNIT_FACTORS[unit], held
+        self.own_bias = calibration.bias if held is None else np.array(held.bias)
+        self.bias = self.own_bias * self.factor
+        self.matrix = calibration.matrix if held is None else np.array(held.matrix)
+        self.K: Values = np.asarray(np.linalg.solve(self.matrix, np.eye(3)))
+        self.full_K: Values = np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)))
         of_sensor = [e for e in calibration.effects if owner_of(e) == Owner.SENSOR]
         self.effects = {e.name: e.values for e in of_sensor}
         self.bench_effects = [e.name for e in calibration.effects if e not in of_sensor]
@@ -193,7 +199,7 @@ class ExportedSensor:
     @property
     def bias_after_matrix(self) -> Values:
         """The bias in calibrated units: ``matrix @ bias``."""
-        return np.asarray(self.matrix @ self.calibration.bias * self.factor)
+        return np.asarray(self.matrix @ self.bias)
 
     @property
     def bias_deviation(self) -> Values:
@@ -214,12 +220,12 @@ class ExportedSensor:
 
         ``sqrt(sum_i (1 - K_ii^2 / |K_i|^2) / 3)``
         """
-        return float(np.sqrt(np.sum(1.0 - np.diag(self.K) ** 2 / np.sum(self.K**2, axis=1)) / 3.0))
+        return float(np.sqrt(np.sum(1.0 - np.diag(self.full_K) ** 2 / np.sum(self.full_K**2, axis=1)) / 3.0))
 
     @property
     def bias_error(self) -> float:
         """Likewise after a correction by only the bias: ``|1 - K| / sqrt(3)``."""
-        return float(np.linalg.norm(np.eye(3) - self.K) / np.sqrt(3.0))
+        return float(np.linalg.norm(np.eye(3) - self.full_K) / np.sqrt(3.0))
 
     @property
     def follows_temperature(self) -> bool:
@@ -230,7 +236,7 @@ class ExportedSensor:
     def bias_polynomial(self) -> Values:
         """Coefficients of the bias in powers 0 to 3 of T - 25 degC: (3, 4) array, one row per axis."""
         polynomial = np.zeros((3, ORDER))
-        polynomial[:, 0] = self.calibration.bias
+        polynomial[:, 0] = self.own_bias
         polynomial[:, 1] += self.effects.get("bias_temperature", np.zeros(3))
         polynomial[:, 1:3] += self.effects.get("bias_temperature_quadratic", np.zeros(6)).reshape(3, 2)
         polynomial[:, 1:] += self.effects.get("bias_temperature_cubic", np.zeros(9)).reshape(3, 3)

@@ -1,0 +1,102 @@
+"""Fit what formats of other programs can hold: a part of the matrix, and none or some of the effects.
+
+The truth t of the full calibration at the samples of the fit is the reference. With the readings r without the effects
+that a format holds, the accelerometer's matrix S and bias b minimise
+
+    sum |t - S (r - b)|^2,    S: full, diagonal, or 1
+
+A gyroscope turns to one side more than to the other, so that a fitted bias would not be that at rest: its diagonal is
+``s_i = K_ii / |K_i|^2``, with K the inverse of the full matrix, and its bias contains the mean of the effects that are
+not held and depend on time and temperature alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core.records import Reduced
+from pipeline.evaluation.held_out.error_breakdown import rms_error_of, with_known_effects
+from pipeline.physics.effects import effect_of, owner_of
+from pipeline.physics.effects.base import Owner
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.core.records import FittedEffect, SensorCalibration, Values
+    from pipeline.evaluation.held_out.samples import Samples
+
+BIAS_OVER_TEMPERATURE = ("bias_temperature", "bias_temperature_quadratic", "bias_temperature_cubic")
+# part of the matrix, and effects, of the formats in ``pipeline/output/exports/templates``
+HELD: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("full", ()),
+    ("full", ("g_sensitivity",)),
+    ("full", BIAS_OVER_TEMPERATURE),
+    ("full", (*BIAS_OVER_TEMPERATURE, "scale_factor_temperature")),
+    ("diagonal", ()),
+    ("diagonal", BIAS_OVER_TEMPERATURE),
+    ("none", ()),
+    ("none", BIAS_OVER_TEMPERATURE),
+)
+FEWEST_ROWS = 6  # orientations, of which an axis has an offset and three factors
+AT_REST_TOO = {"time", "temperature"}  # signals
+
+
+def reduced(calibration: SensorCalibration, fitted: Sequence[Samples], held_out: Sequence[Samples]) -> list[Reduced]:
+    """Return the best that each kind of format holds, with its error on held-out samples.
+
+    Kinds that hold all of the calibration are left out, and all where the samples of the fit are too few.
+    """
+    own = {e.name for e in calibration.effects if owner_of(e) == Owner.SENSOR}
+    if sum(int(s.known.sum()) for s in fitted) < FEWEST_ROWS:
+        return []
+    truth = _calibrated(calibration, fitted)
+    found: dict[tuple[str, frozenset[str]], Reduced] = {}
+    for part, names in HELD:
+        kept = frozenset(names) & own
+        if (part, kept) in found or (part == "full" and kept == own):
+            continue
+        effects = tuple(e for e in calibration.effects if e.name in kept or e.name not in own)
+        partial = replace(calibration, effects=effects)
+        if calibration.sensor == "gyroscope":  # effects of the motion have no mean that a log would have
+            partial = replace(calibration, effects=tuple(e for e in calibration.effects if e in effects or _moving(e)))
+        left = truth if partial.effects == calibration.effects else _calibrated(partial, fitted)
+        bias, matrix = _fitted(calibration, part, left, truth)
+        partial = replace(partial, effects=effects)
+        error = rms_error_of(replace(partial, bias=bias, matrix=matrix), held_out)
+        found[part, kept] = Reduced(part, sorted(kept), bias.tolist(), matrix.tolist(), error)
+    return list(found.values())
+
+
+def _moving(fitted: FittedEffect) -> bool:
+    """Return whether an effect depends on more than time and temperature."""
+    return not effect_of(fitted).fields("gyroscope", fitted.values) <= AT_REST_TOO
+
+
+def _calibrated(calibration: SensorCalibration, samples: Sequence[Samples]) -> Values:
+    """Return calibrated readings at samples that represent the recordings: (n, 3) array."""
+    return np.concatenate([with_known_effects(calibration, s)[0][s.representative] for s in samples])
+
+
+def _fitted(calibration: SensorCalibration, part: str, left: Values, truth: Values) -> tuple[Values, Values]:
+    """Return bias and matrix; ``left``: calibrated readings without the effects that are not held, (n, 3)."""
+    known = np.isfinite(left + truth).all(axis=1)
+    left, truth, K = left[known], truth[known], np.linalg.inv(calibration.matrix)
+    reading = left @ K.T  # minus the bias
+    diagonal = np.diag(np.diag(K) / np.sum(K**2, axis=1))
+    if calibration.sensor == "gyroscope":
+        matrix = {"full": calibration.matrix, "diagonal": diagonal, "none": np.eye(3)}[part]
+        return calibration.bias + np.mean((left - truth) @ K.T, axis=0), np.asarray(matrix)
+    ones = np.ones((len(reading), 1))
+    matrix = np.eye(3)
+    if part == "none":
+        offset = np.mean(truth - reading, axis=0)
+    elif part == "full":
+        *rows, offset = np.linalg.lstsq(np.hstack([reading, ones]), truth, rcond=None)[0]
+        matrix = np.array(rows).T
+    else:
+        pairs = [np.linalg.lstsq(np.hstack([reading[:, [i]], ones]), truth[:, i], rcond=None)[0] for i in range(3)]
+        matrix, offset = np.diag([p[0] for p in pairs]), np.array([p[1] for p in pairs])
+    return calibration.bias - np.linalg.solve(matrix, offset), matrix

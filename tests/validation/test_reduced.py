@@ -1,0 +1,82 @@
+"""What formats of other programs hold, fitted to the recordings, against the best by the truth of a simulation."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from pipeline.app.one_unit import unit_of_recordings
+from pipeline.evaluation.held_out.reduced import HELD
+from pipeline.output.exports import formats
+from pipeline.physics.effects import catalogue
+from pipeline.physics.effects.base import Owner
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription
+
+if TYPE_CHECKING:
+    from pipeline.unit import UnitState
+
+EFFECT = {"accelerometer.quadratic_nonlinearity": [0.004, -0.003, 0.005]}
+
+
+@cache
+def unit(*, added: bool) -> tuple[UnitState, dict]:
+    recordings, truth = simulate_unit(UnitDescription("U", table="acutronic", effects=EFFECT), 7, 0)
+    layers = ["table=acutronic", "sensor=mpu6050", *(["effects.accelerometer=[quadratic_nonlinearity]"] * added)]
+    return unit_of_recordings(recordings, layers).run_to("export"), truth
+
+
+def test_every_format_that_holds_less_has_its_own_fit() -> None:
+    known = {(part, frozenset(names)) for part, names in HELD}
+    of_sensor = {n for n, e in catalogue().items() if e.owner == Owner.SENSOR}
+    for declared, _ in formats().values():
+        for sensor in declared.units:
+            names = frozenset({*declared.effects, *declared.effects_in_part})
+            shown = {n for n in of_sensor if sensor in catalogue()[n].sensors} & names
+            part = declared.matrix.get(sensor, "full")
+            possible = {frozenset(held) & {*catalogue()} for p, held in known if p == part}
+            assert "all" in names or any(shown == {n for n in p if sensor in catalogue()[n].sensors} for p in possible)
+
+
+def test_a_format_without_an_effect_holds_the_best_offset_and_scale() -> None:
+    """With the simulation's own truth t in all directions: least squares of t by offset and scale factors."""
+    state, truth = unit(added=True)
+    text = state.exports["px4.params"]
+    values = {line.split("\t")[2]: float(line.split("\t")[3]) for line in text.splitlines() if line[:1].isdigit()}
+    offset = np.array([values[f"CAL_ACC0_{a}OFF"] for a in "XYZ"]) / 9.80665
+    scale = np.array([values[f"CAL_ACC0_{a}SCALE"] for a in "XYZ"])
+    rng = np.random.default_rng(1)
+    t = rng.standard_normal((20_000, 3))
+    t /= np.linalg.norm(t, axis=1, keepdims=True)
+    K = np.linalg.inv(np.array(truth["accelerometer"]["matrix"]))
+    r = t @ K.T + np.array(truth["accelerometer"]["bias"]) + t**2 * EFFECT["accelerometer.quadratic_nonlinearity"]
+
+    def error(offset: np.ndarray, scale: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.sum(((r - offset) * scale - t) ** 2, axis=1))))
+
+    pairs = [np.linalg.lstsq(np.stack([r[:, i], np.ones(len(r))], axis=1), t[:, i], rcond=None)[0] for i in range(3)]
+    best = error(np.array([-p[1] / p[0] for p in pairs]), np.array([p[0] for p in pairs]))
+    assert error(offset, scale) < 1.05 * best
+    assert np.abs(np.mean((r - offset) * scale - t, axis=0)).max() < 3e-4
+    full = state.calibration["accelerometer"]  # its bias without the effect leaves a third of the effect
+    assert np.abs(np.mean((r - full["bias"]) * scale - t, axis=0)).max() > 1e-3
+
+
+def test_header_and_validation_state_the_error_of_the_file_and_of_the_calibration() -> None:
+    state, _ = unit(added=True)
+    part = state.validation["accelerometer"]
+    (held,) = [r for r in part["reduced"] if (r["part"], r["effects"]) == ("diagonal", [])]
+    last = part["steps"][-1]["rms_error"]
+    assert last < held["rms_error"]
+    text = state.exports["px4.params"]
+    assert f"held-out rms error of the accelerometer {held['rms_error']:.4g} g" in text
+    assert (
+        f"With all of the calibration: held-out rms error of the accelerometer, + quadratic_nonlinearity: {last:.4g} g"
+        in text
+    )
+    # adding an effect makes no file worse that cannot hold it
+    (before,) = [r for r in unit(added=False)[0].validation["accelerometer"]["reduced"] if r["part"] == "diagonal"]
+    assert held["rms_error"] == pytest.approx(before["rms_error"], rel=0.05)
