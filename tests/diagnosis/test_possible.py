@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,8 +9,8 @@ from unit_settings import settings_of
 
 from pipeline.core.records import Candidate, Estimate, Noise, Recording, SensorCalibration, SensorDiagnosis
 from pipeline.core.verdicts import Verdict
-from pipeline.evaluation.diagnosis.diagnose import without_impossible
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput
+from pipeline.evaluation.diagnosis.diagnose import without_harmful, without_impossible
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, harmful
 from pipeline.evaluation.diagnosis.verdict import MAX_SCATTER_BY_HAND, VerdictInput, decide
 
 if TYPE_CHECKING:
@@ -95,3 +96,29 @@ def test_moves_that_scatter_far_beyond_the_noise_are_unexplained() -> None:
     assert "6.6 times the noise" in reason
     steady = VerdictInput("gyroscope", Verdict.NOTHING_MISSING, on_table=False, scatter=0.9 * MAX_SCATTER_BY_HAND)
     assert decide(steady)[0] == Verdict.NOTHING_MISSING
+
+
+def test_effects_that_raise_the_error_of_units_of_exchange_are_not_offered() -> None:
+    rng = np.random.default_rng(1)
+    noise = 1.0 + 0.1 * rng.standard_normal(20)
+    better, worse = 0.5 * noise, noise + 0.2 + 0.1 * rng.standard_normal(20)
+    assert harmful(["a"], [noise, better], "") == {}
+    assert list(harmful(["a"], [noise, worse], "")) == ["a"]
+    assert list(harmful(["a", "b"], [worse, better, noise], "")) == ["b"]
+    assert harmful(["a", "b"], [noise, worse, better], "") == {}  # worse only while b is missing
+    assert harmful(["a"], [noise[:3], worse[:3]], "") == {}  # too few
+    slow = np.cumsum(rng.standard_normal(20))  # successive units that rise and fall together show little
+    assert harmful(["a"], [noise, noise + slow - slow.mean() + 0.3 * slow.std()], "") == {}
+
+
+def test_an_effect_that_harms_is_a_candidate_and_the_others_stay() -> None:
+    one, other = bias_temperature(0.5), missing("bias_drift", {"d_x": 0.001}, 1e-4)
+    both = replace(one, selected=["bias_temperature", "bias_drift"], ranking=[*one.ranking, *other.ranking],
+                   override="effects.gyroscope=[bias_temperature,bias_drift]")  # fmt: skip
+    found = without_harmful(both, {"bias_drift": "it makes the error 1.2 times as large"})
+    assert (found.verdict, list(found.selected)) == (Verdict.MISSING_EFFECT, ["bias_temperature"])
+    assert found.override == "effects.gyroscope=[bias_temperature]"
+    assert "bias drift fits" in found.reason.lower()
+    assert_no_cause(
+        without_harmful(one, {"bias_temperature": "it makes the error larger"}), "bias_temperature", "larger"
+    )

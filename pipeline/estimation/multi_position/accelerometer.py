@@ -236,12 +236,12 @@ class AccelerometerModel:
         """Return the number of samples in the equations."""
         return float(self.rests.count.sum())
 
-    def held_out_error(self, state: State) -> float | None:
-        """Return the rms error of |f| at held-out rests, g; None if there are none."""
+    def held_out_squares(self, state: State) -> Values:
+        """Return the squared error of |f| at each held-out rest, g^2: (m,) array."""
         if self.held is None or len(self.held.time) == 0:
-            return None
+            return np.zeros(0)
         force, _ = self.specific_force(state, self.held)
-        return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - self.gravity) ** 2)))
+        return np.asarray((np.linalg.norm(force, axis=1) - self.gravity) ** 2)
 
     def without(self, held: Mask) -> AccelerometerModel:
         """Return the model with some of its rests held out."""

@@ -131,13 +131,13 @@ class GyroscopeModel:
         """Return the number of samples in the equations."""
         return float(self.rests.count.sum()) + (0.0 if self.moves is None else float(np.sum(self.moves.weight > 0)))
 
-    def held_out_error(self, state: State) -> float | None:
-        """Return the rms of the rate at held-out rests, deg/s; None if there are none."""
+    def held_out_squares(self, state: State) -> Values:
+        """Return the squared rate at each held-out rest, (deg/s)^2: (m,) array."""
         held = self.every.held_out
         if not held.any():
-            return None
+            return np.zeros(0)
         error, _ = self._rate_at_rest(self.every.select(held), self.at_rests.force[held], state)
-        return float(np.sqrt(np.mean(np.sum((error @ state.matrix.T) ** 2, axis=1))))
+        return np.asarray(np.sum((error @ state.matrix.T) ** 2, axis=1))
 
     def with_excess(self, variance: Values) -> GyroscopeModel:
         """Return the model with an additional independent error of each move; ``variance``: (k,), deg^2."""

@@ -83,6 +83,26 @@ EARTH = "earth_rotation"
 OTHER_FILE = "check that the sensor's file is that of this unit, and that its range and units are right"
 
 
+def without_harmful(found: SensorDiagnosis, harmful: Mapping[str, str]) -> SensorDiagnosis:
+    """Return the diagnosis without the selected effects that raise the held-out error, which become candidates."""
+    harmful = {name: reason for name, reason in harmful.items() if name in found.selected}
+    if not harmful:
+        return found
+    left = [name for name in found.selected if name not in harmful]
+    told = "; ".join(f"{plain(name)} fits and is not offered: {reason}" for name, reason in harmful.items())
+    missing = found.verdict == Verdict.MISSING_EFFECT and not left
+    head, _, names = found.override.partition("[")
+    kept = [name for name in names.rstrip("]").split(",") if name and name not in harmful]
+    return replace(
+        found,
+        verdict=Verdict.UNEXPLAINED if missing else found.verdict,
+        selected=left,
+        candidates={**found.candidates, **harmful},
+        reason=f"{found.reason} {told[0].upper()}{told[1:]}.".strip(),
+        override=f"{head}[{','.join(kept)}]" if left and found.override else "",
+    )
+
+
 def without_impossible(found: SensorDiagnosis, case: DiagnosisInput) -> SensorDiagnosis:
     """Return the diagnosis with the selected effects that are not possible as candidates, and without a selection."""
     reasons = {entry.effect: reason for entry in found.chosen if (reason := _contradiction(entry, case))}
@@ -190,7 +210,8 @@ def diagnose(
             doubts += _doubts_of_axes(leaning, calibration)
         evidence = replace(evidence, doubts=doubts, moves=moves, scatter=_scatter(calibration))
         found = judged(found, evidence)
-        return without_impossible(found, case), full or may_be_unknown(found.verdict, evidence)
+        found = without_impossible(without_harmful(found, findings.harmful if findings else {}), case)
+        return found, full or may_be_unknown(found.verdict, evidence)
 
     try:
         findings = procedure.findings(case)

@@ -5,7 +5,8 @@ unknown. So a larger scatter of the rests is reported, but alone it is no sign o
 
 Twenty rests are too few to hold some out of a selection. So the selection uses all of them, and cross-validation
 judges it: each of ``REST_FOLDS`` models leaves out every third rest with the move before it. ``held_out_error`` of a
-ranking is that of the selected effects, fitted without those rests. ``cross_validation`` also repeats the selection.
+ranking is that of the selected effects, fitted without those rests. ``cross_validation`` also repeats the selection. An
+effect that raises the error at these rests, or after these moves, significantly is not offered (``findings.harmful``).
 
 The residual depends on time, temperature (powers 1 to 2 or 3 over their span) or the axis' own specific force
 (Chebyshev polynomials of degree 4 and 5) if such curves, with free coefficients on every axis, have delta BIC > 10 and
@@ -15,7 +16,7 @@ m p < 1e-3, with m the number of all tests.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
@@ -38,13 +39,14 @@ from pipeline.estimation.multi_position.fit import (
     log_likelihoods,
     project_out,
 )
+from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import NoiseHypothesis
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import SelectionByHand, posterior
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import is_given
 from pipeline.evaluation.diagnosis import functional_forms as forms
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, harmful
 from pipeline.evaluation.diagnosis.method_errors import given_differences
 from pipeline.evaluation.diagnosis.observability import MORE_RESTS, never_shown, not_observable_by_hand
 from pipeline.evaluation.diagnosis.residual_dependence import added_variable_of_rests, significant
@@ -57,7 +59,7 @@ if TYPE_CHECKING:
 
     from pipeline.core.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
     from pipeline.core.settings import Settings
-    from pipeline.estimation.multi_position.model import Equations, Model, State
+    from pipeline.estimation.multi_position.model import Equations, Model
     from pipeline.physics.effects.base import Effect
 
 NEEDED_RECORDING = MORE_RESTS
@@ -95,6 +97,8 @@ def findings(case: DiagnosisInput) -> Findings:
     best = selection.hypotheses[int(np.argmax(scores))]
     signal, folds = selection.first.signal, _folds(selection, lambda part: SelectionByHand(part, *given, COMPARED_STEP))
 
+    held_out = _held_out(selection, folds)
+
     def calibrated(fit: FitByHand) -> SensorCalibration:
         return calibration_of(model, fit, calibration, case.settings)
 
@@ -120,7 +124,8 @@ def findings(case: DiagnosisInput) -> Findings:
         squares=chi,
         drop_alone=lambda name: float(signal[name] @ signal[name]) if name in signal else 0.0,
         excess=max(chi[0] - (len(selection.fits[0].residual) - selection.fits[0].rank), chi[0] - chi[-1]),
-        held_out=_held_out_errors(selection, folds),
+        held_out=held_out.errors,
+        harmful=held_out.harmful(selection.names),
         hidden=hidden,
         unknown=unknown,
         over_noise=over,
@@ -230,12 +235,35 @@ def _over_noise(model: Model, equations: Equations, expected: NoiseHypothesis) -
     return float(np.sqrt(residual @ residual / freedom)) if freedom > 0 else None
 
 
-def _held_out_errors(selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand, int]]) -> list[float | None]:
-    """Return the rms error, g or deg/s, of each fit of the selection on rests that are left out of it in turn."""
+@dataclass(frozen=True)
+class LeftOut:
+    """The squared errors of each fit of a selection at rests, and in moves, that are left out of it in turn."""
+
+    of_rests: Sequence[Values]  # each (m,), g^2 or (deg/s)^2; without a fit's effects, and with each further one
+    of_moves: Sequence[Values] = ()  # each (k,), deg^2; of the gyroscope
+    judged: Sequence[bool] = ()  # whether each fit has some degrees of freedom in every fold
+
+    @property
+    def errors(self) -> list[float | None]:
+        """The rms error of each fit."""
+        pairs = zip(self.of_rests, self.judged, strict=True)
+        return [float(np.sqrt(np.mean(squares))) if known else None for squares, known in pairs]
+
+    def harmful(self, names: Sequence[str]) -> dict[str, str]:
+        """Return the effects that raise an error significantly, with the reason."""
+        of_moves = harmful(names, self.of_moves, "after moves that the fit leaves out") if self.of_moves else {}
+        return of_moves | harmful(names, self.of_rests, "at rests that the fit leaves out")
+
+
+def _held_out(selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand, Mask]]) -> LeftOut:
+    """Return the errors of each fit of the selection on rests and moves that are left out of it in turn."""
     model = selection.model
     if not folds:  # a recording for validation, or nothing is selected
-        return [model.held_out_error(each.state) for each in selection.fits] if selection.names else [None]
-    errors: list[float | None] = []
+        squares = [model.held_out_squares(each.state) for each in selection.fits]
+        return LeftOut(squares, judged=[bool(selection.names) and len(squares[0]) > 0] * len(squares))
+    rests, moves, judged = [], [], []
+    left_out = [model.without(~held) for _, held in folds] if isinstance(model, GyroscopeModel) else []
+    moving = bool(left_out) and all(part.moves is not None for part in left_out)
     for k, each in enumerate(selection.fits):
         fits = [
             fold.fits[k]
@@ -243,14 +271,17 @@ def _held_out_errors(selection: SelectionByHand, folds: Sequence[tuple[Selection
             else fit(fold.model, each.state, selection.hypotheses, selection.bounds, small=COMPARED_STEP)
             for fold, _ in folds
         ]
-        judged = all(len(fitted.residual) >= fitted.rank + SPARE for fitted in fits)
-        squares = (held * _squared(fold.model, fitted.state) for (fold, held), fitted in zip(folds, fits, strict=True))
-        errors.append(float(np.sqrt(sum(squares) / len(model.rests.time))) if judged else None)
-    return errors
+        judged.append(all(len(fitted.residual) >= fitted.rank + SPARE for fitted in fits))
+        pairs = list(zip(folds, fits, strict=True))
+        rests.append(np.concatenate([fold.model.held_out_squares(fitted.state) for (fold, _), fitted in pairs]))
+        if moving:
+            errors = [part.direction_errors(f.state)[0] for part, f in zip(left_out, fits, strict=True)]
+            moves.append(np.concatenate(errors) ** 2)
+    return LeftOut(rests, moves, judged)
 
 
 def _cross_validation(
-    selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand, int]]
+    selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand, Mask]]
 ) -> dict[str, Any] | None:
     """Return the errors of the whole procedure, selection included, on rests that are left out of it in turn.
 
@@ -260,25 +291,23 @@ def _cross_validation(
     if not folds:
         return None
     named = Counter(name for fold, _ in folds for name in fold.names)
-    squares = [[held * _squared(fold.model, fold.fits[k].state) for k in (0, -1)] for fold, held in folds]
+    squares = [[fold.model.held_out_squares(fold.fits[k].state).sum() for k in (0, -1)] for fold, _ in folds]
     before, after = np.sqrt(np.sum(squares, axis=0) / len(selection.model.rests.time)).tolist()
     return {"folds": REST_FOLDS, "error_before": before, "error_after": after, "named": dict(named)}
 
 
-def _folds(selection: SelectionByHand, select: Callable[[Model], SelectionByHand]) -> list[tuple[SelectionByHand, int]]:
-    """Return the selections that leave out every third rest in turn, each with the number of rests left out.
+def _folds(
+    selection: SelectionByHand, select: Callable[[Model], SelectionByHand]
+) -> list[tuple[SelectionByHand, Mask]]:
+    """Return the selections that leave out every third rest in turn, each with the rests left out.
 
     Empty if nothing was selected, or if there is a recording for validation.
     """
     model = selection.model
-    if not selection.names or model.held_out_error(selection.fits[0].state) is not None:
+    if not selection.names or len(model.held_out_squares(selection.fits[0].state)):
         return []
     held: list[Mask] = [np.arange(len(model.rests.time)) % REST_FOLDS == k for k in range(REST_FOLDS)]
-    return [(select(model.without(rests)), int(rests.sum())) for rests in held]
-
-
-def _squared(model: Model, state: State) -> float:
-    return (model.held_out_error(state) or 0.0) ** 2
+    return [(select(model.without(rests)), rests) for rests in held]
 
 
 class _Curve(NamedTuple):

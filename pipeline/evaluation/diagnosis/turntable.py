@@ -40,7 +40,7 @@ from pipeline.estimation.observations import observe, without_each_recording
 from pipeline.estimation.posterior import posterior
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, harmful
 from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, why_not_suggested
 from pipeline.evaluation.diagnosis.method_errors import method_errors
 from pipeline.evaluation.diagnosis.observability import alike_with_zeros, never_shown, not_observable, one_way
@@ -181,6 +181,7 @@ def _stretches(observations: Observations, shares: Values, of_block: Index) -> l
 NEEDED_RECORDING = "record turns about all three axes on a table whose angle and rate are logged"
 # mean square of a residual over that of noise below which effects cannot explain a part of the excess
 UNEXPLAINABLE_RATIO = 1.1
+HELD_OUT_PIECES = 20  # of held-out motion: some seconds each
 
 
 def findings(case: DiagnosisInput) -> Findings:
@@ -223,7 +224,8 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     sensor, noise, selection, reported = case.sensor, case.noise, discovery.context, discovery.reported
     observations, unknown = selection.observations, discovery.unknown
     fits = _fits(reported)
-    errors, floor = _held_out_errors(reported, fits, case)
+    squares_held_out, floor = _held_out_squares(reported, fits, case)
+    errors = [float(np.sqrt(np.nanmean(squares))) for squares in squares_held_out]
     held_out = None
     if errors and noise is not None:
         held_out = SelectionErrors(errors[0], errors[-1], floor)
@@ -284,6 +286,7 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
         drop_alone=drop_alone,
         excess=excess,
         held_out=errors or [None] * len(fits),
+        harmful=_harmful(reported.names, squares_held_out),
         hidden={**hidden, **alike_with_zeros(reported)},
         unknown=unknown,
         over_noise=_over_noise(selection.base, case, reference),
@@ -316,8 +319,18 @@ def _fits(selection: Selection) -> list[JointFit]:
     return [*fits, selection.fit] if selection.names else fits
 
 
-def _held_out_errors(selection: Selection, fits: Sequence[JointFit], case: DiagnosisInput) -> tuple[list[float], float]:
-    """Return the held-out error of each fit, and the noise floor of the last; no errors without held-out motion."""
+def _harmful(names: Sequence[str], squares: Sequence[Values]) -> dict[str, str]:
+    """Return the effects that raise the error on held-out motion significantly, with the reason."""
+    if not squares:
+        return {}
+    pieces = np.array([[np.nanmean(p) for p in np.array_split(each, HELD_OUT_PIECES)] for each in squares])
+    return harmful(names, [*pieces[:, np.isfinite(pieces).all(axis=0)]], "on held-out motion")
+
+
+def _held_out_squares(
+    selection: Selection, fits: Sequence[JointFit], case: DiagnosisInput
+) -> tuple[list[Values], float]:
+    """Return the squared held-out errors of each fit, and the noise floor of the last; none without held-out motion."""
     noise = case.noise or Noise(np.zeros(3), np.zeros(3), 1.0, "none")
     held = [r for r in case.recordings if r.role == "validation"] if selection.names else []
     found = [samples_of_motion(case.sensor, r, noise, case.settings.table, smoothed=True) for r in held]
@@ -327,7 +340,7 @@ def _held_out_errors(selection: Selection, fits: Sequence[JointFit], case: Diagn
     calibrations = [calibration_of(fit, selection.observations, None) for fit in fits]
     corrected = [[with_known_effects(calibration, each) for each in samples] for calibration in calibrations]
     directed = all(true is not None for of_fit in corrected for _, _, true in of_fit)
-    errors: list[float] = []
+    found_squares: list[Values] = []
     for of_fit in corrected:
         squares = []
         for each, (vector, magnitude, true) in zip(samples, of_fit, strict=True):
@@ -335,9 +348,9 @@ def _held_out_errors(selection: Selection, fits: Sequence[JointFit], case: Diagn
             if directed and true is not None:
                 error = np.linalg.norm(vector - true, axis=1)
             squares.append(error[each.known] ** 2)
-        errors.append(float(np.sqrt(np.nanmean(np.concatenate(squares)))))
+        found_squares.append(np.concatenate(squares))
     floor, vector_floor = noise_floors(calibrations[-1], samples)
-    return errors, floor if vector_floor is None or not directed else vector_floor
+    return found_squares, floor if vector_floor is None or not directed else vector_floor
 
 
 def _shares(selection: Selection, name: str) -> dict[str, float]:

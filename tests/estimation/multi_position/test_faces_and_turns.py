@@ -177,7 +177,7 @@ def test_a_part_with_too_few_moves_is_fitted_by_its_rests_and_turns_alone(whole:
     assert both.state.matrix == pytest.approx(one.state.matrix, abs=1e-12)
     assert both.state.bias == pytest.approx(one.state.bias, abs=1e-12)
     assert both.log_likelihood == pytest.approx(one.log_likelihood, abs=1e-9)
-    assert part.held_out_error(both.state) == pytest.approx(alone.held_out_error(one.state), abs=1e-12)
+    assert part.held_out_squares(both.state) == pytest.approx(alone.held_out_squares(one.state), abs=1e-12)
 
 
 def test_a_missing_face_is_named() -> None:
