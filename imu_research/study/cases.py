@@ -35,6 +35,7 @@ from pipeline.core.files import CONFIGS
 from pipeline.core.records import SENSORS, Values
 from pipeline.estimation.uncertainty_budget import DITHERED
 from pipeline.physics.effects import effect
+from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
@@ -311,6 +312,8 @@ def drawn(model: str, sensor: str, name: str, rng: np.random.Generator, factor: 
     values = values * rng.choice([-1.0, 1.0], count)
     if name == "low_pass_lag":
         values = np.abs(values)
+    if name == "earth_rotation":  # a sensor cannot sense more than Earth turns
+        values *= min(1.0, EARTH_RATE_DPS / float(np.linalg.norm(values)))
     if name == "warm_up":
         values[3] = np.exp(rng.uniform(np.log(90.0), np.log(400.0)))
     return np.asarray(values, np.float64)
