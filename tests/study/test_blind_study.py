@@ -20,6 +20,7 @@ from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import SENSORS
 from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.physics.effects import catalogue
+from pipeline.physics.kinematics import EARTH_RATE_DPS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,7 +48,10 @@ def test_sizes_lie_within_30_percent_of_the_data_sheets_and_have_both_signs() ->
         size = np.atleast_1d(SIZES[case.model][case.sensor][name])
         count = 3 if name == "warm_up" else len(values)  # without its time constant
         ratio = np.abs(values[:count]) / np.broadcast_to(size[:count], count)
-        assert np.all((ratio > 0.699) & (ratio < 1.301))
+        if name == "earth_rotation":  # in any direction, and no more than Earth turns
+            assert 0.6999 * size[0] < np.linalg.norm(values) < 1.0001 * EARTH_RATE_DPS
+        else:
+            assert np.all((ratio > 0.699) & (ratio < 1.301))
         negative += np.sum(np.array(values) < 0)
     assert 0.3 < negative / sum(len(v) for case in cases for v in case.hidden.values()) < 0.7
     assert {case.sensor for case in cases} == set(SENSORS)
