@@ -5,7 +5,8 @@ from html import unescape
 from typing import Any
 
 from pipeline.output.pages import unit_page
-from pipeline.output.pages.fleet import LINK_MARK, MARK, runs_data, with_history
+from pipeline.output.pages.fleet import runs_data, with_history
+from pipeline.output.pages.pages import LINK_MARK, MARK
 
 from .conftest import Unit
 

@@ -18,8 +18,9 @@ from pipeline.output.history import errors_of, of_units, record, unit_state
 from pipeline.output.outcome import changes_of, counted
 from pipeline.output.pages import campaign_page
 from pipeline.output.pages.chart import Figure
-from pipeline.output.pages.fleet import MARK, runs_data, times_of, with_history
+from pipeline.output.pages.fleet import runs_data, times_of, with_history
 from pipeline.output.pages.group_charts import Point, bars
+from pipeline.output.pages.pages import MARK
 from pipeline.output.pages.parameters import summary_row
 from pipeline.output.pages.residual_section import limit_rows
 from pipeline.output.pages.unit_page import render

@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,6 +61,15 @@ def test_without_a_server_the_command_runs_the_stage(tmp_path: Path, monkeypatch
             monkeypatch.setenv("IMU_CALIBRATION_JOB_SERVER", address)
         done = subprocess.run([*VERDICT, "none.json"], cwd=tmp_path, check=False)
         assert done.returncode == 0
+
+
+def test_the_server_imports_no_pandas() -> None:
+    code = (
+        "import sys; from pipeline.app.steps.job_server import _prepare; _prepare();"
+        "print([m for m in ('pandas', 'matplotlib', 'hydra', 'snakemake') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def _process_in(folder: Path, but: int = 0) -> int:

@@ -55,8 +55,7 @@ from pipeline.estimation.uncertainty_budget import NOISE_SOURCE, own_and_bench
 from pipeline.estimation.uncertainty_budget import combined as budget_of
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.ingest.files import wrong_name
-from pipeline.output.pages.fleet import MARK
-from pipeline.output.pages.pages import number, template
+from pipeline.output.pages.pages import MARK, number, template
 from pipeline.output.pages.parameters import fitted_parameters
 from pipeline.physics.effects import owner_of
 from pipeline.physics.effects.base import Owner

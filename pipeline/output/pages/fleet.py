@@ -44,7 +44,7 @@ from pipeline.output.history import difference, dropped, errors_of, of_units
 from pipeline.output.outcome import add_command, uncertainty_words
 from pipeline.output.pages.chart import Figure
 from pipeline.output.pages.group_charts import Point, bars
-from pipeline.output.pages.pages import number, template
+from pipeline.output.pages.pages import LINK_MARK, MARK, number, template
 from pipeline.output.pages.parameters import PARAMETER_KEYS, SUMMARY_COLUMNS
 
 if TYPE_CHECKING:
@@ -290,7 +290,6 @@ def _cell(value: object) -> object:
     return f"{value:.9g}" if isinstance(value, float) else value
 
 
-MARK, LINK_MARK = "<!-- history -->", "<!-- history link -->"  # in templates/unit.html
 SHOWN = 12  # runs in a chart: the first, and the last ones
 LABEL_LETTERS = 50  # letters of a bar's text before the ratio; a bar is 66 letters long
 STATES = 10_000  # of units in runs after the first that a campaign's page contains: 2 MB at 0.2 kB each

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from pipeline.core.files import JSON
 
 
+MARK, LINK_MARK = "<!-- history -->", "<!-- history link -->"  # in templates/unit.html
 NOTHING = "\N{EN DASH}"
 PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"))
 MINUS = "\N{MINUS SIGN}"
