@@ -132,8 +132,7 @@ def validate(
             notes.append(
                 f"the expected error is not stated, because {', '.join(names)} {verb} left out of the held-out error"
             )
-        fitted = case.fit_samples() if part.held_out else samples
-        part = replace(part, notes=tuple(notes), reduced=tuple(reduced(calibration, fitted, samples)))
+        part = replace(part, notes=tuple(notes), reduced=tuple(reduced(case, samples, held_out=part.held_out)))
     return replace(part, limits=_check_limits(calibration, part.steps[-1], settings.limits.of(sensor)))
 
 

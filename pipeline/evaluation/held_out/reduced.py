@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.core.records import FittedEffect, SensorCalibration, Values
-    from pipeline.evaluation.held_out.samples import Samples
+    from pipeline.evaluation.held_out.samples import HeldOutCase, Samples
 
 BIAS_OVER_TEMPERATURE = ("bias_temperature", "bias_temperature_quadratic", "bias_temperature_cubic")
 # part of the matrix, and effects, of the formats in ``pipeline/output/exports/templates``
@@ -44,15 +44,21 @@ FEWEST_ROWS = 6  # orientations, of which an axis has an offset and three factor
 AT_REST_TOO = {"time", "temperature"}  # signals
 
 
-def reduced(calibration: SensorCalibration, fitted: Sequence[Samples], held_out: Sequence[Samples]) -> list[Reduced]:
-    """Return the best that each kind of format holds, with its error on held-out samples.
+def reduced(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) -> list[Reduced]:
+    """Return the best that each kind of format holds, with its error on samples; ``held_out``: no fit used them.
 
-    Kinds that hold all of the calibration are left out, and all where the samples of the fit are too few.
+    Kinds that hold all of the calibration are left out, and all where the samples of the fit are too few. On a table,
+    a calibration without effects needs no motion, and that of a gyroscope no samples: its bias remains.
     """
+    calibration = case.calibration
     own = {e.name for e in calibration.effects if owner_of(e) == Owner.SENSOR}
-    if sum(int(s.known.sum()) for s in fitted) < FEWEST_ROWS:
-        return []
-    truth = _calibrated(calibration, fitted)
+    plain = held_out and not calibration.effects and not case.by_hand
+    fitted, truth = samples, np.empty((0, 3))
+    if not plain or calibration.sensor != "gyroscope":
+        fitted = case.fit_samples(followed=not plain) if held_out else samples
+        if sum(int(s.known.sum()) for s in fitted) < FEWEST_ROWS:
+            return []
+        truth = _calibrated(calibration, fitted)
     found: dict[tuple[str, frozenset[str]], Reduced] = {}
     for part, names in HELD:
         kept = frozenset(names) & own
@@ -65,7 +71,7 @@ def reduced(calibration: SensorCalibration, fitted: Sequence[Samples], held_out:
         left = truth if partial.effects == calibration.effects else _calibrated(partial, fitted)
         bias, matrix = _fitted(calibration, part, left, truth)
         partial = replace(partial, effects=effects)
-        error = rms_error_of(replace(partial, bias=bias, matrix=matrix), held_out)
+        error = rms_error_of(replace(partial, bias=bias, matrix=matrix), samples)
         found[part, kept] = Reduced(part, sorted(kept), bias.tolist(), matrix.tolist(), error)
     return list(found.values())
 
@@ -82,13 +88,18 @@ def _calibrated(calibration: SensorCalibration, samples: Sequence[Samples]) -> V
 
 def _fitted(calibration: SensorCalibration, part: str, left: Values, truth: Values) -> tuple[Values, Values]:
     """Return bias and matrix; ``left``: calibrated readings without the effects that are not held, (n, 3)."""
-    known = np.isfinite(left + truth).all(axis=1)
-    left, truth, K = left[known], truth[known], np.linalg.inv(calibration.matrix)
-    reading = left @ K.T  # minus the bias
+    K = np.linalg.inv(calibration.matrix)
     diagonal = np.diag(np.diag(K) / np.sum(K**2, axis=1))
     if calibration.sensor == "gyroscope":
         matrix = {"full": calibration.matrix, "diagonal": diagonal, "none": np.eye(3)}[part]
-        return calibration.bias + np.mean((left - truth) @ K.T, axis=0), np.asarray(matrix)
+        if left is truth:
+            return calibration.bias, np.asarray(matrix)
+        change = left - truth
+        change = change[np.isfinite(change).all(axis=1)]
+        return calibration.bias + np.mean(change @ K.T, axis=0), np.asarray(matrix)
+    known = np.isfinite(left + truth).all(axis=1)
+    left, truth = left[known], truth[known]
+    reading = left @ K.T  # minus the bias
     ones = np.ones((len(reading), 1))
     matrix = np.eye(3)
     if part == "none":

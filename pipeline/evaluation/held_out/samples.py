@@ -128,10 +128,10 @@ class HeldOutCase:
             "validation"
         )
 
-    def fit_samples(self) -> list[Samples]:
-        """Return the samples that the fit used."""
+    def fit_samples(self, *, followed: bool = True) -> list[Samples]:
+        """Return the samples that the fit used; ``followed``: see ``samples_of_motion``."""
         sensor = self.calibration.sensor
-        return self._in_motion(sensor) or self._at_rests_of("rests") or self._at_rests_of(sensor)
+        return self._in_motion(sensor, followed=followed) or self._at_rests_of("rests") or self._at_rests_of(sensor)
 
     def at_rests(self, rests: Mapping[str, Sequence[Rest]]) -> list[Samples]:
         """Return the mean readings of given rests, by the name of their recording."""
@@ -143,13 +143,13 @@ class HeldOutCase:
     def _at_rests_of(self, role: str) -> list[Samples]:
         return self.at_rests({r.name: split_rests(r, 0).used for r in self.recordings if r.role == role})
 
-    def _in_motion(self, role: str, *, smoothed: bool = False) -> list[Samples]:
+    def _in_motion(self, role: str, *, smoothed: bool = False, followed: bool = True) -> list[Samples]:
         sensor, table, chosen = self.calibration.sensor, self.settings.table, self.recordings
         if self.by_hand:  # without a log of the motion the specific force between the rests is unknown
             logs = ("table_attitude", "table_rate", "table_angle")
             chosen = [r for r in chosen if any(getattr(r, log) is not None for log in logs)]
         found = [
-            samples_of_motion(sensor, r, self.noise, table, other=self.other, smoothed=smoothed)
+            samples_of_motion(sensor, r, self.noise, table, other=self.other, smoothed=smoothed, followed=followed)
             for r in chosen
             if r.role == role
         ]
@@ -206,17 +206,18 @@ def samples_of_motion(
     *,
     other: SensorCalibration | None = None,
     smoothed: bool = False,
+    followed: bool = True,
 ) -> Samples | None:
     """Return the samples of a recording, or None without readings of the sensor or without a reference.
 
     ``other``: calibration of the other sensor. With ``smoothed``, a reference whose attitude is known passes the filter
-    of the recording: the filter then causes no error.
+    of the recording: the filter then causes no error. ``followed``: whether an attitude that is known is used.
     """
     reading, n = recording.reading(sensor), recording.samples
     if reading is None or n == 0:
         return None
     delay = float(recording.filter.get("delay_s", 0.0))
-    motion, earth = table_motion(recording, table), earth_of(table)
+    motion, earth = table_motion(recording, table) if followed else None, earth_of(table)
     smoothed = smoothed and motion is not None and recording.filter["name"] != "none"
     if motion is not None:
         motion = filtered_motion(motion, recording) if smoothed else shifted(motion, -delay)
