@@ -302,7 +302,7 @@ def clock_contribution(
 
 
 def limit_contribution(
-    gain: Values, names: Sequence[str], curvature: Values, covariance: Values, place: Values
+    gain: Values, of_limits: Values, curvature: Values, covariance: Values, place: Values
 ) -> tuple[Contribution, Values]:
     """Return the contribution of misalignments by the sensor file's limits, and its first-order covariance.
 
@@ -311,17 +311,16 @@ def limit_contribution(
     ``d^T H_i d / 2`` of a normal error d has the mean ``tr(H_i C) / 2`` and the covariances ``tr(H_i C H_j C) / 2``
     (JCGM 100, 5.1.2, note).
 
-    ``gain``: (p, n), of the equations over their standard deviations, on the fitted parameters; the last equations are
-    the pseudo-observations of the ``names``. ``curvature``: (n, p, p), of the same equations. ``covariance``: (p, p),
-    C. ``place``: (12, p).
+    ``gain``: (p, n), of the equations over their standard deviations, on the fitted parameters. ``of_limits``: (p, l),
+    change of these by each limit. ``curvature``: (n, p, p), of the equations. ``covariance``: (p, p), C. ``place``:
+    (12, p).
     """
-    of_limits = gain[:, gain.shape[1] - len(names) :]
     HC = curvature @ covariance
     mean = 0.5 * np.trace(HC, axis1=1, axis2=2)
     bent = 0.5 * np.einsum("iab,jba->ij", HC, HC) + np.outer(mean, mean)
     first = place @ of_limits @ of_limits.T @ place.T
     total = first + place @ gain @ bent @ gain.T @ place.T
-    return Contribution(LIMIT, "B", NORMAL, total, np.full(len(total), np.inf), remark=", ".join(names)), first
+    return Contribution(LIMIT, "B", NORMAL, total, np.full(len(total), np.inf)), first
 
 
 def combined(

@@ -118,13 +118,10 @@ CLEARLY_BELOW = 0.9  # of the limit: axes of turns that are known so well, and n
 RECORDING_ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 
-def _limits(data_sheet: DataSheet, frame: float) -> dict[str, float]:
-    """Return the standard uncertainty of each element of the matrix, uniform within the sensor file's limits.
-
-    ``frame``: of each angle between the frame of the fit and the case, rad, to which the limits refer.
-    """
+def _limits(data_sheet: DataSheet) -> dict[str, float]:
+    """Return the standard uncertainty of each element of the matrix, uniform within the sensor file's limits."""
     scale, cross = (limit / np.sqrt(3.0) for limit in (data_sheet.scale_factor, data_sheet.cross_axis))
-    return {name: float(scale if name in ONE else np.hypot(cross, frame)) for name in MATRIX_NAMES}
+    return {name: float(scale if name in ONE else cross) for name in MATRIX_NAMES}
 
 
 def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings) -> SensorCalibration:
@@ -138,7 +135,7 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     accelerometer = accelerometer_of(recordings, settings)
     data_sheet, sheet = settings.sensor.gyroscope, procedure.sheet is not None
     frame_deg = frame_error(accelerometer, settings)
-    limits = _limits(data_sheet, np.radians(frame_deg)) if sheet else {}
+    limits = _limits(data_sheet) if sheet else {}
     model = model_of(filtered, None, noise, procedure, accelerometer, known_by_limit=limits, frame_deg=frame_deg)
     advice = RECORDING_ADVICE + advice_on_held_out(filtered, procedure)
     if model is None or not (model.moves or model.turns or sheet):
@@ -150,6 +147,7 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     noises = prior_hypotheses(wander_prior(noise, data_sheet), float(np.mean(model.white)), model.kinds)
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
     fit_model = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
+    of_frame = np.radians(frame_deg) ** 2 * (1.0 - np.eye(3)).ravel()
 
     def fit_with(held: Mapping[str, float], whole: GyroscopeModel = model) -> tuple[Found, Values]:
         part = copy(whole)
@@ -161,7 +159,8 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
                 f"{advice}"
             )
         found = fit_robustly(part, fit_model, filtered)
-        return found, np.sqrt(np.diag(found[1].covariance))[MATRIX]
+        # limits and axes are of the case: no gyroscope shows the frame of the accelerometer in it
+        return found, np.sqrt(np.maximum(np.diag(found[1].covariance)[MATRIX] - of_frame, 0.0))
 
     model, fitted, outlying = with_limits(limits, fit_with) if sheet else fit_with({})[0]
     moved, faces = np.zeros(BASE_COUNT), procedure.faces

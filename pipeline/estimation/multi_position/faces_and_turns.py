@@ -37,6 +37,7 @@ from pipeline.core.records import AXES, Index, Mask, Motion, Recording, SensorCa
 from pipeline.estimation.multi_position.model import EquationBlock, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import padded, sound_span, spans_between, tangents, trapezoids
 from pipeline.estimation.rest_means import ROLE, Rests
+from pipeline.physics.kinematics import skew
 from pipeline.physics.signal.segments import AXIS_ACCURACY, LOGGED_TURNS, MAX_AXIS_SINE, SCALE, multiples
 
 if TYPE_CHECKING:
@@ -307,6 +308,7 @@ class TurnsByHand:
     # each (r,), deg; of the equations, and standard uncertainty
     value: Values
     error: Values
+    frame: float  # rad; standard uncertainty of each angle between the frame of the fit and the case
     by_length: bool = False  # whether the angle of a turn is |Phi|, whatever its axis, as a sheet states it
 
     def equations(self, state: State, white: Values) -> EquationBlock:
@@ -338,7 +340,13 @@ class TurnsByHand:
             error,
             np.einsum("rtc,t,c->crt", -WM, length, white) / error[:, None],
             (self.time[:, 0], self.time[:, -1] - self.time[:, 0], self.recording),
+            frame=self._by_frame() / error[:, None] if self.frame else None,
         )
+
+    def _by_frame(self) -> Values:
+        """Return the change of the residuals by each angle of the frame off the case: (r, 3) array, deg."""
+        turned = (self.stated[:, None] * self.direction) @ skew(np.eye(3)).transpose(0, 2, 1)  # (3, t, 3)
+        return np.asarray(-self.frame * np.einsum("rti,kti->rk", self.rows, turned))
 
     def described(self, state: State) -> list[dict[str, Any]]:
         """Return recording, start in s, axis, stated and calibrated total angle in deg of each turn."""
@@ -409,17 +417,14 @@ def turns_of(
     chosen = stated_turns(recordings, rests, procedure, role)
     if not chosen:
         return None
-    found = _gathered(recordings, chosen, accelerometer, frame_deg)
-    return replace(found, by_length=procedure.sheet is not None)
+    found = _gathered(recordings, chosen, accelerometer)
+    return replace(found, frame=float(np.radians(frame_deg)), by_length=procedure.sheet is not None)
 
 
 def _gathered(
-    recordings: Sequence[Recording],
-    chosen: Sequence[StatedTurn],
-    accelerometer: SensorCalibration | None,
-    frame_deg: float,
+    recordings: Sequence[Recording], chosen: Sequence[StatedTurn], accelerometer: SensorCalibration | None
 ) -> TurnsByHand:
-    """Return the samples of turns, and their equations; ``frame_deg``: see ``turns_of``."""
+    """Return the samples of turns, and their equations."""
     pairs = [(recordings[t.recording], at) for t, at in zip(chosen, padded([t.span for t in chosen]), strict=True)]
     force = [
         np.zeros((len(at), 3))
@@ -440,7 +445,7 @@ def _gathered(
         share = np.degrees(signed / np.sum(signed * stated * cosine[first]))
         rows += [share[:, None] * e for e in across_axis(direction[first])]
         value += [0.0, 0.0]
-        error += 2 * [float(np.hypot(accuracy[first], frame_deg))]
+        error += 2 * [float(accuracy[first])]
     return TurnsByHand(
         name=tuple(r.name for r, _ in pairs),
         recording=np.array([t.recording for t in chosen]),
@@ -455,6 +460,7 @@ def _gathered(
         rows=np.array(rows),
         value=np.array(value),
         error=np.array(error),
+        frame=0.0,
     )
 
 

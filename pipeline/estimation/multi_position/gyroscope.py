@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.core.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX
+from pipeline.core.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX, MATRIX_NAMES
 from pipeline.estimation.engine import cholesky, draw_normal
 from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, SMALLEST_NOISE, white_of
 from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, turns_of
@@ -76,7 +76,8 @@ class GyroscopeModel:
 
     ``rests``: all, also held-out ones, at which a move may begin. ``gravity``: at each rest, by the accelerometer.
     ``fewest``: smallest number of moves that are used. ``turns``: of a stated total angle. ``known_by_limit``: elements
-    of the matrix with a pseudo-observation, each with its u. ``between``: see ``model``.
+    of the matrix with a pseudo-observation, each with its u. ``between``: see ``model``. ``frame``: standard
+    uncertainty of each angle between the frame of the fit and the case, rad.
     """
 
     sensor = "gyroscope"
@@ -92,12 +93,13 @@ class GyroscopeModel:
         turns: TurnsByHand | None = None,
         known_by_limit: Mapping[str, float] | None = None,
         between: float = 0.0,
+        frame: float = 0.0,
     ) -> None:
         self.every, self.at_rests, self.noise, self.fewest = rests, gravity, noise, fewest
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
         self.rests, self.force = rests.select(~rests.held_out), gravity.force[~rests.held_out]
         self.moves, self.turns = moves if moves is not None and moves.count >= fewest else None, turns
-        self.known_by_limit, self.between = known_by_limit or {}, between
+        self.known_by_limit, self.between, self.frame = known_by_limit or {}, between, frame
         self.kinds = 1 if self.moves is None else 2
         free = self.moves is not None or turns is not None or bool(known_by_limit)
         self.directions = np.eye(BASE_COUNT)[:, BASE if free else BIAS]
@@ -119,8 +121,16 @@ class GyroscopeModel:
             blocks.append(self.turns.equations(state, self.white))
         if self.known_by_limit:
             columns = np.eye(BASE_COUNT)[[BASE_NAMES.index(name) for name in self.known_by_limit]]
-            blocks.append(limit_block(self.known_by_limit, columns, state))
+            blocks.append(replace(limit_block(self.known_by_limit, columns, state), frame=self._of_limits_by_frame()))
         return stacked(blocks, self, state, candidates)
+
+    def _of_limits_by_frame(self) -> Values | None:
+        """Return the change of the pseudo-observations by each angle of the frame off the case: (k, 3) array."""
+        if not self.frame:
+            return None
+        u = np.array(list(self.known_by_limit.values()))
+        change = skew(np.eye(3)).reshape(3, 9)[:, [MATRIX_NAMES.index(name) for name in self.known_by_limit]]
+        return np.asarray(-self.frame * change.T / u[:, None])
 
     @property
     def temperature(self) -> Values:
@@ -163,6 +173,7 @@ class GyroscopeModel:
             turns=self.turns,
             known_by_limit=self.known_by_limit,
             between=self.between,
+            frame=self.frame,
         )
         part.kinds = self.kinds
         return part
@@ -387,6 +398,7 @@ def model_of(
         turns=turns,
         known_by_limit=known_by_limit,
         between=between_recordings(rests, turns, noise) if sheet else 0.0,
+        frame=float(np.radians(frame_deg)),
     )
 
 

@@ -19,7 +19,8 @@ k   : at least 1: scatter beyond the hypotheses of a grid (``fit``)
 A parameter that the recordings do not determine has a separate equation, a pseudo-observation of the value of an ideal
 sensor with the standard uncertainty u by the sensor file's limit. ``between`` is the standard
 deviation of the bias from one recording to the next, over white noise: it adds ``between^2 H J H^T`` to S, where J is 1
-for two stretches of one recording and else 0.
+for two stretches of one recording and else 0. Limits and stated axes are of the case, and the frame of the fit is off
+it by three angles of one standard uncertainty: their change F of the equations adds ``F F^T`` to S.
 
 The models of both sensors have: ``kinds`` of scatter (1: rests; 2: rests and moves), ``rests_equations`` (their number;
 they come first), ``white`` noise of a raw sample, and ``directions``, (12, b): change of bias and matrix by each base
@@ -127,6 +128,7 @@ class Equations:
     # each (n, n); S and D
     common: Values | None = None
     direction: Values | None = None
+    frame: Values | None = None  # (n, 3); F
     _kernels: dict[float, Values] = field(default_factory=dict, compare=False, repr=False)
 
     @property
@@ -190,6 +192,7 @@ class EquationBlock:
     # each (n, n); None: zeros
     common: Values | None = None
     direction: Values | None = None
+    frame: Values | None = None  # (n, 3); F; None: zeros
     shared: Values | None = None  # (n, 12); change of moves by errors of the accelerometer's calibration
     force: Values | None = None  # (n, m, 3); change of moves by the specific force at each rest, per g
 
@@ -226,6 +229,10 @@ def stacked(
     if model.between:
         added = model.between**2 * np.sum(bias @ same.astype(float) @ bias.transpose(0, 2, 1), axis=0)
         common = added if common is None else common + added
+    frame = None
+    if any(block.frame is not None for block in blocks):
+        frame = np.concatenate([np.zeros((len(b.residual), 3)) if b.frame is None else b.frame for b in blocks])
+        common = frame @ frame.T if common is None else common + frame @ frame.T
     return Equations(
         residual=np.concatenate([block.residual for block in blocks]),
         base=np.concatenate([block.base for block in blocks]) @ model.directions,
@@ -239,6 +246,7 @@ def stacked(
         error=np.concatenate([block.error for block in blocks]),
         common=common,
         direction=diagonal([block.direction for block in blocks]),
+        frame=frame,
     )
 
 

@@ -172,10 +172,11 @@ def limits_contribution(model: Model, fitted: FitByHand) -> tuple[list[Contribut
     X = equations.columns
     inverse = np.linalg.inv(equations.covariance(fitted.noise))
     gain = scaled_inverse(X.T @ inverse @ X) @ X.T @ inverse
-    line, first = limit_contribution(
-        gain, list(model.known_by_limit), curvature(model, fitted), fitted.covariance, place
-    )
-    return [line], first
+    of_limits = gain[:, -len(model.known_by_limit) :]  # their pseudo-observations are the last equations
+    if equations.frame is not None:
+        of_limits = np.hstack([of_limits, gain @ equations.frame])
+    line, first = limit_contribution(gain, of_limits, curvature(model, fitted), fitted.covariance, place)
+    return [replace(line, remark=", ".join(model.known_by_limit))], first
 
 
 def _with_monte_carlo(

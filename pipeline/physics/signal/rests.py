@@ -32,7 +32,14 @@ import numpy as np
 
 from pipeline.core.records import BETWEEN_ATTITUDES_S, Integers, Mask, Recording, Values, median, noise_of_steps, once
 from pipeline.physics.signal.filters import filter_autocovariance, stretch_starts
-from pipeline.physics.signal.quiet_motion import RATE_LIMIT_DPS, counts_of, creep_of_rest, quiet_pieces, windows
+from pipeline.physics.signal.quiet_motion import (
+    RATE_LIMIT_DPS,
+    before_slow_motion,
+    counts_of,
+    creep_of_rest,
+    quiet_pieces,
+    windows,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -192,7 +199,10 @@ def _quiet_parts(recording: Recording) -> tuple[Spans, float]:
     found = [_below(variance, multiple * noise, recording, size) for multiple in VARIANCE_MULTIPLES]
     quiet = found[_plateau([len(rests) for rests in found])]
     if recording.gyroscope is not None and quiet:
-        quiet = quiet_pieces(recording.gyroscope, quiet, _interval(recording), _shortest(recording))
+        cut = recording.gyroscope, _interval(recording), _shortest(recording)
+        quiet = quiet_pieces(cut[0], quiet, *cut[1:])
+        if recording.kind == "turn":
+            quiet = before_slow_motion(cut[0], quiet, *cut[1:])
     return quiet, noise
 
 

@@ -37,13 +37,13 @@ def errors(unit: Unit, document: dict[str, Any], sensor: str, *, in_case: bool =
     return np.where(U > 0.0, value / np.where(U > 0.0, U, 1.0), 0.0)
 
 
-def with_three_turns(folder: Path, angle: float = 360.0) -> Unit:
-    """A rest, and a turn about each axis by a stop, without an accelerometer."""
+def with_three_turns(folder: Path, angle: float = 360.0, sensors: str = "g") -> Unit:
+    """A rest, and a turn about each axis by a stop; without an accelerometer by default."""
     unit, up = Unit(folder, np.random.default_rng(4)), np.array([0.0, 0.0, 1.0])
-    unit.write("still", "rest,,,,", *at_rest(20.0, up), "g")
+    unit.write("still", "rest,,,,", *at_rest(20.0, up), sensors)
     for axis, e in zip("xyz", np.eye(3), strict=True):
         turn = joined(at_rest(4.0, up), turned(angle, 90.0, e, up), at_rest(4.0, up))
-        unit.write(f"turn_{axis}", f"turn,{axis},{angle:g},0.05,", *turn, "g")
+        unit.write(f"turn_{axis}", f"turn,{axis},{angle:g},0.05,", *turn, sensors)
     unit.sheet()
     return unit
 
@@ -125,6 +125,28 @@ def test_rests_beside_a_turn_are_found_without_an_accelerometer(tmp_path: Path) 
     for turn in stage["turns"]:
         assert turn["time_s"] == pytest.approx(4.0, abs=0.6)
     assert unit.rows
+
+
+@pytest.mark.parametrize("sensors", ["g", "ag"])
+def test_a_turn_that_begins_and_ends_slowly_is_used_whole(tmp_path: Path, sensors: str) -> None:
+    unit, e, up = Unit(tmp_path, np.random.default_rng(8)), np.eye(3)[0], np.array([0.8, 0.0, 0.6])
+    unit.write("still", "rest,,,,", *at_rest(20.0, up), sensors)
+    turn = joined(at_rest(3.0, up), turned(720.0, 55.0, e, up), at_rest(3.0, up))  # 3 deg in its first two seconds
+    unit.write("turn", "turn,x,720,0.1,", *turn, sensors)
+    unit.sheet()
+    found = calibrated(tmp_path).calibration
+    assert found["gyroscope"]["expanded_uncertainty"]["matrix"][0][0] < 0.002
+    assert abs(errors(unit, found, "gyroscope", in_case=sensors == "g")[3]) < 1.5
+
+
+def test_limits_and_axes_share_the_error_of_the_accelerometers_frame(tmp_path: Path) -> None:
+    with_three_turns(tmp_path, sensors="ag")
+    found = calibrated(tmp_path).calibration["gyroscope"]
+    across = np.array(found["expanded_uncertainty"]["matrix"])[~np.eye(3, dtype=bool)]
+    frame = cross = 0.02 / np.sqrt(3.0)  # cross_axis of either sensor in the sensor file
+    axis = np.radians(1.5)  # axis_accuracy_deg; whole turns: gravity is where it was, and shows no axis
+    u = np.sqrt(frame**2 + cross**2 * axis**2 / (cross**2 + axis**2))
+    assert across == pytest.approx(np.full(6, 1.96 * u), rel=0.05)
 
 
 def test_a_turn_in_the_other_sense_is_refused_with_the_angle_that_agrees(tmp_path: Path) -> None:
