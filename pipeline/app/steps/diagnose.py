@@ -93,6 +93,7 @@ def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)
         validation=validated.sensors[sensor],
         gravity=gravity,
         moves=validated.moves_error if sensor == "gyroscope" else None,
+        departures=validated.turn_departures if sensor == "gyroscope" else (),
     )
     other = next(c for s, c in known.items() if s != sensor)
     densities = effective_noise(calibration, filtered, noise, settings.table, found, other=other)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.core.records import SensorValidation, Validation, calibrated
 from pipeline.estimation.noise import required_noises
-from pipeline.evaluation.held_out.attitude import attitude, gravity_direction
+from pipeline.evaluation.held_out.attitude import attitude, gravity_direction, turn_departures
 from pipeline.evaluation.held_out.heldout import validate
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ def validate_unit(unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit]
         held_out_errors(recordings, fits, settings),
         attitude(found["accelerometer"], found["gyroscope"], filtered),
         gravity_direction(**found, recordings=filtered, noise=noise, procedure=settings.procedure),
+        turn_departures(**found, recordings=filtered, noise=noise, procedure=settings.procedure),
     )
 
 

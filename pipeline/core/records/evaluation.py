@@ -186,6 +186,7 @@ class Validation:
     sensors: Mapping[str, SensorValidation | None]  # None for a sensor without a calibration
     attitude: dict[str, Any]  # see ``pipeline.evaluation.held_out.attitude``
     gravity_direction: dict[str, Any]
+    turn_departures: tuple[str, ...] = ()  # held-out turns whose stated angle the calibrated gyroscope contradicts
 
     @property
     def moves_error(self) -> MovesError | None:
@@ -205,13 +206,15 @@ class Validation:
             **{sensor: part and part.to_json() for sensor, part in self.sensors.items()},
             "attitude": self.attitude,
             "gravity_direction": self.gravity_direction,
+            **({"turn_departures": list(self.turn_departures)} if self.turn_departures else {}),
         }
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
         """Return the object from the value of ``to_json``."""
         parts = {sensor: data[sensor] and SensorValidation.from_json(data[sensor]) for sensor in SENSORS}
-        return cls(data["unit"], parts, data["attitude"], data["gravity_direction"])
+        departures = tuple(data.get("turn_departures", ()))
+        return cls(data["unit"], parts, data["attitude"], data["gravity_direction"], departures)
 
 
 @dataclass(frozen=True)

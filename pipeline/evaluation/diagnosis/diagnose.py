@@ -178,6 +178,7 @@ def diagnose(
     validation: SensorValidation | None = None,
     gravity: SensorDiagnosis | None = None,
     moves: MovesError | None = None,
+    departures: Sequence[str] = (),
 ) -> SensorDiagnosis:
     """Return the diagnosis of a sensor.
 
@@ -185,7 +186,7 @@ def diagnose(
     no part in the selection. ``accelerometer``: the unit's other calibration, which a gyroscope by hand needs for the
     direction of gravity. ``validation``: of the calibration; without it, a free fit replaces the calibration.
     ``gravity``: for a gyroscope, the diagnosis of the accelerometer. ``moves``: for a gyroscope by hand,
-    ``Validation.moves_error``.
+    ``Validation.moves_error``; ``departures``: ``Validation.turn_departures``.
     """
     sensor, settings = calibration.sensor, settings.replaced(uncertainty=Uncertainty(monte_carlo=0))
     by_hand = is_multi_position(sensor, recordings)
@@ -203,7 +204,7 @@ def diagnose(
     def judge(findings: Findings | None, found: SensorDiagnosis) -> tuple[SensorDiagnosis, bool]:
         """Return the diagnosis with its verdict, and whether to search for a formula outside the catalogue."""
         evidence = evidence_of(found, case, validation, findings)
-        doubts = list(evidence.doubts)
+        doubts = [*evidence.doubts, *departures]
         if by_gravity and gravity:
             doubts += _doubts_of_gravity(gravity, case)
         elif not leaning.keys() & {*configured, *found.selected}:

@@ -23,6 +23,8 @@ import numpy as np
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import (
+    BASE,
+    BIAS,
     MATRIX,
     Integers,
     Noise,
@@ -33,11 +35,12 @@ from pipeline.core.records import (
     level_in_body,
 )
 from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.multi_position.accelerometer import white_of
 from pipeline.estimation.multi_position.faces_and_turns import turns_of
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.moves import moves_of, observed_rests
-from pipeline.estimation.rest_means import HELD_OUT, ROLE, is_multi_position
+from pipeline.estimation.rest_means import HELD_OUT, ROLE, is_multi_position, rests_of
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.physics.compensation import Compensation
 from pipeline.physics.effects import effect
@@ -257,3 +260,37 @@ def gravity_direction(
             for before, after in zip(*map(turns.described, states.values()), strict=True)
         ]
     return found
+
+
+def turn_departures(
+    accelerometer: SensorCalibration | None,
+    gyroscope: SensorCalibration | None,
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    procedure: Procedure,
+) -> tuple[str, ...]:
+    """Describe the held-out turns of a sheet whose stated angle the calibrated gyroscope contradicts.
+
+    The angle is that of the calibrated rate. Its variance has noise, the stated accuracy, the calibration's
+    uncertainty, the bias wander, and, as a bias that differs between files, the mean of the held-out rests less the
+    bias.
+    """
+    if gyroscope is None or procedure.sheet is None or not is_multi_position("gyroscope", recordings):
+        return ()
+    rests = rests_of("gyroscope", recordings, procedure, None, HELD_OUT)
+    if rests is None:
+        return ()
+    turns = turns_of(
+        recordings, replace(rests, held_out=np.zeros(len(rests.time), bool)), accelerometer, procedure, HELD_OUT
+    )
+    if turns is None:
+        return ()
+    terms = tuple(EffectColumns(effect(e.name), e.values) for e in gyroscope.effects)
+    block = turns.equations(State(gyroscope.bias, gyroscope.matrix, terms), white_of(rests, noise))
+    J = block.base * block.error[:, None]
+    between = np.average(rests.reading, axis=0, weights=rests.count) - gyroscope.bias
+    wander = np.zeros(3) if noise is None else noise.wander
+    variance = block.error**2 + np.einsum("rp,pq,rq->r", J, gyroscope.parameters.covariance[BASE, BASE], J)
+    deviation = np.sqrt(variance + J[:, BIAS] ** 2 @ (between**2 + wander**2))
+    deviation[len(turns.name) :] = np.inf  # the axes refer to the case, of whose angles to the frame nothing is known
+    return tuple(turns.departures(block.residual * block.error, deviation))

@@ -59,6 +59,20 @@ def test_three_turns_and_a_rest_calibrate_a_gyroscope(tmp_path: Path) -> None:
     assert np.all(scale < 4.0 * 0.05 / 360.0 + 2.0 * 0.1 / 360.0 * 16.0)  # the stop, and the bias over eight seconds
 
 
+@pytest.mark.parametrize(("stated", "departs"), [(360.0, False), (357.5, True)])
+def test_a_held_out_turn_whose_stated_angle_is_wrong_is_a_reference_in_doubt(
+    stated: float, *, departs: bool, tmp_path: Path
+) -> None:
+    unit, up = with_three_turns(tmp_path), np.array([0.0, 0.0, 1.0])
+    turn = joined(at_rest(4.0, up), turned(360.0, 90.0, np.eye(3)[2], up), at_rest(4.0, up))
+    unit.write("judge", f"turn,z,{stated:g},0.05,yes", *turn, "g")
+    unit.sheet()
+    found = calibrated(tmp_path, "procedure.turns.axis_accuracy_deg=0.1")
+    assert ("turn_departures" in found.validation) is departs
+    assert (found.verdict["gyroscope"] == "reference_in_doubt") is departs
+    assert ("judge is 2.5 deg off" in found.diagnosis["gyroscope"]["reason"]) is departs
+
+
 def test_an_axis_that_is_known_to_a_degree_leaves_the_cross_axis_terms_to_the_sensor_file(tmp_path: Path) -> None:
     with_three_turns(tmp_path)
     result = calibrated(tmp_path)
