@@ -249,7 +249,7 @@ def test_a_scan_of_single_forms_finds_what_the_products_of_all_curves_say() -> N
         columns = columns_of(texts, "gyroscope")
         values = scan.values(columns)
         expected = ProjectedCurves(scan, columns).drop([0, 1])[:, :, -1:]
-        found = scan.drops(np.stack([values, 2.0 * values + 1.0], axis=-2))[:, :, :1]
+        found = scan.drops(scan.of_axes(np.stack([values, 2.0 * values + 1.0], axis=-2)), 2)[:, :, :1]
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
         one, other = scan.best_axes(found, 2)[0], scan.best_axes(expected, 2)[0]
         assert (one.axes, one.setting) == (other.axes, other.setting)
@@ -286,7 +286,7 @@ def test_a_power_that_the_base_holds_already_says_nothing_new() -> None:
     scan = Scan(selection)
     curves = columns_of(["fx", "fx ** 2", "2 * fx ** 2 + 3 * fy", "cos(radians(angle))"], "accelerometer")
     assert ProjectedCurves(scan, curves).independent([0, 1, 2]) == [1]
-    drops = scan.drops(scan.values(curves)[..., None])
+    drops = scan.drops(scan.of_axes(scan.values(curves)[..., None]))
     assert drops[:, :, 0].max() == 0.0
     assert drops[:, :, 1].max() > 0.0
 

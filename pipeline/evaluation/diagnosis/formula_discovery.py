@@ -35,7 +35,7 @@ from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import without_each_recording, without_rows
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.evaluation.diagnosis import functional_forms as forms
-from pipeline.evaluation.diagnosis.functional_forms import Form, FormGain, ProjectedCurves, Scan, Span
+from pipeline.evaluation.diagnosis.functional_forms import Form, FormGain, ProjectedCurves, Scan, Span, Whitened
 from pipeline.evaluation.diagnosis.residual_dependence import dependences
 from pipeline.evaluation.diagnosis.words import listed
 from pipeline.physics.effects import catalogue, effect_from, forget, register
@@ -55,6 +55,7 @@ MAX_FORMULA_TERMS = 3
 REFINED = 16  # forms that are scored under every noise setting, and whose constants are scanned more finely
 SCAN_REFINEMENTS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
 VALUES_AT_ONCE = 4_000_000  # of columns that are scanned together: 32 MB
+VALUES_KEPT = 8_000_000  # of whitened columns for the search of further terms: 64 MB
 PROBED = 200  # rows; two forms whose values there are equal to 1e-9 are one
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
 OBSERVABLE_BY = {"temperature": "bias_temperature"}  # effect that is observable if the recordings vary the covariate
@@ -87,6 +88,8 @@ class Forms:
     def __init__(self, selection: Selection) -> None:
         self.selection, self.sensor = selection, selection.observations.sensor
         self._columns: dict[str, Values] = {}
+        self._kept: dict[tuple[int, int, int], list[Whitened]] = {}  # columns of the coarse scan
+        self._values_left = VALUES_KEPT
         self.explain(())
 
     def explain(self, formulas: Sequence[str]) -> None:
@@ -123,9 +126,14 @@ class Forms:
             size = max(8, VALUES_AT_ONCE // (len(self.selection.observations.weight) * r * axes))
             for first in range(0, len(members), size):
                 some = members[first : first + size]
-                columns = np.stack([self.columns(tried[k]) for k in some], axis=-2)
+                versions = self._kept.get((r, axes, first)) if coarse else None
+                if versions is None:
+                    versions = scan.of_axes(np.stack([self.columns(tried[k]) for k in some], axis=-2))
+                    needed = sum(v.inside.size + v.means.size for v in versions)
+                    if coarse and needed <= self._values_left:
+                        self._kept[r, axes, first], self._values_left = versions, self._values_left - needed
                 scanned = np.array([tried[k].scanned for k in some])
-                found |= dict(zip(some, scan.best_axes(scan.drops(columns), r, scanned), strict=True))
+                found |= dict(zip(some, scan.best_axes(scan.drops(versions, r), r, scanned), strict=True))
         return [found[k] for k in range(len(tried))]
 
     def ranked(self) -> list[ScoredForm]:
@@ -155,10 +163,10 @@ class Forms:
         """Return the forms of the coarse scan without those of the catalogue; of equal forms the simplest."""
         spans = self._spans
         turning = any(part.motion.axis is not None for part in self.selection.observations.parts)
-        factors = forms.factors(spans, turning=turning)
+        factors, modulators = forms.factors(spans, turning=turning), forms.modulators(spans)
         pairs = [
             Form(factor, modulator)
-            for modulator in forms.modulators(spans)
+            for modulator in modulators
             for factor in factors
             if modulator is None or factor.signal != modulator.signal or factor.kind == "step"
         ]
@@ -167,9 +175,12 @@ class Forms:
         terms = [term for each in declared if each for term in each.terms.values()]
         known = [term.formulas[""].text for term in terms if "" in term.formulas and not term.shared]
         seen = {_digest(self.column(text)[rows]) for text in known}
+        each = {factor.texts: factor for factor in (*factors, *modulators) if factor}
+        probed = {texts: self.columns(Form(factor))[rows] for texts, factor in each.items()}
         distinct = []
         for form in sorted(pairs, key=lambda form: form.complexity):
-            digest = _digest(self.columns(form)[rows])
+            values = probed[form.factor.texts]
+            digest = _digest(values * probed[form.modulator.texts] if form.modulator else values)
             if digest not in seen:
                 seen.add(digest)
                 distinct.append(form)

@@ -54,9 +54,8 @@ POWERS = range(1, 6)
 COARSE_STEP_POSITIONS = 20  # of a step in the coarse scan, which places it to 1/40 of the span
 SPEEDS = 40  # largest number of speeds between which steps are tried
 SHARPEST = 1.0 / 80.0  # least width of a soft step, share of the span: smoothing makes a sharp step this wide
-CONSTANTS = tuple(
-    np.geomspace(0.06, 1.5, 9)
-)  # share of the span; the finer scans close the factors of 1.5 between them
+# share of the span; the finer scans close the factors of 1.5 between them
+CONSTANTS = tuple(np.geomspace(0.06, 1.5, 9))
 FINER = 4  # places or constants to each side of the best one in each finer scan
 SOFT_STEP_WIDTHS = (0.5, 1.0, 2.0)  # of a soft step in a finer scan, over that of the scan before
 SAME_SPEED = 0.02  # relative difference of values that are one speed of the procedure
@@ -442,7 +441,8 @@ class Scan:
     def whitened(self, columns: Values) -> Whitened:
         """Return (n, q) columns whitened."""
         means = self._blocks.sums(self._weight[:, None] * columns) / self._blocks.weight[:, None]
-        inside = np.sqrt(self._weight)[:, None] * (columns - means[self._label])
+        inside = columns - means[self._label]
+        inside *= np.sqrt(self._weight)[:, None]
         return Whitened(inside, self._noise.whitened(means))
 
     def without_model(self, c: int, one: Whitened, other: Whitened) -> Values:
@@ -450,6 +450,13 @@ class Scan:
         known, _, inverse = self._fitted[c]
         taken = one.times(self._every)[:, :, known] @ inverse @ self._every.times(other)[:, known]
         return np.asarray((one.times(other) - taken) / self.scale[c] ** 2)
+
+    def squares_without_model(self, c: int, one: Whitened) -> Values:
+        """Return the squares of columns on an axis without their part in the model, white noise first: (t, q)."""
+        known, _, inverse = self._fitted[c]
+        cross = one.times(self._every)[:, :, known]
+        own = np.einsum("tqm,tqm->tq", one.means, one.means) + np.einsum("nq,nq->q", one.inside, one.inside)
+        return np.asarray((own - np.einsum("tqp,tqp->tq", cross @ inverse, cross)) / self.scale[c] ** 2)
 
     def log_likelihood(self, rss: Values, within: Values | None = None) -> Values:
         """Return the log likelihood under each noise setting, (t, ...), of whitened sums of squares.
@@ -485,13 +492,13 @@ class Scan:
             for m, a in enumerate(best.tolist())
         ]
 
-    def drops(self, columns: Values) -> Values:
-        """Return the drops of forms under each noise on each axis: (t, 3, m) array.
+    def of_axes(self, columns: Values) -> list[Whitened]:
+        """Return (n, 3, m, r) columns of m forms with r coefficients whitened, or (n, 1, m, r) equal on all axes."""
+        return [self.whitened(columns[:, c].reshape(len(columns), -1)) for c in range(columns.shape[1])]
 
-        ``columns``: (n, 3, m, r) of m forms with r coefficients, or (n, 1, m, r) if they are equal on all axes.
-        """
-        n, axes, _, r = columns.shape
-        inner, cross, error = self.products([self.whitened(columns[:, k].reshape(n, -1)) for k in range(axes)], r)
+    def drops(self, versions: Sequence[Whitened], r: int = 1) -> Values:
+        """Return the drops of m forms of r columns under each noise on each axis: (t, 3, m); see ``products``."""
+        inner, cross, error = self.products(versions, r)
         explained, new = each_explains(inner, cross[..., None], error)
         new &= new[0]
         return np.asarray(np.where(new.all(axis=3), explained[..., 0].sum(axis=3), 0.0)[1:])

@@ -175,9 +175,9 @@ def _tests_of_steps(selection: Selection, covariates: Sequence[str], scan: Scan)
 
     values = scan.values(curves)
     pairs = values[:, :, steps:].reshape(len(values), 1, 2, ripples).swapaxes(2, 3)  # cosine and sine of each
-    of_pairs = scan.drops(pairs)
+    of_pairs = scan.drops(scan.of_axes(pairs), pairs.shape[3])
     of_pairs = of_pairs[:, :, np.any(of_pairs, axis=(0, 1))]
-    drops = np.concatenate([scan.drops(values[:, :, :steps, None]), of_pairs], axis=2)
+    drops = np.concatenate([scan.drops(scan.of_axes(values[:, :, :steps, None])), of_pairs], axis=2)
     parameters = np.repeat([4, 6], [steps, of_pairs.shape[2]])
     return names + ["angle"] * of_pairs.shape[2], scan.gains(drops, parameters), parameters
 
@@ -191,7 +191,7 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     for c, drawn in enumerate(_draws(selection)):
         draws = scan.whitened(scan.scale[c] * drawn)
         left[:, 0] += scan.left[:, c]
-        left[:, 1:] += np.einsum("tss->ts", scan.without_model(c, draws, draws))[1:]
+        left[:, 1:] += scan.squares_without_model(c, draws)[1:]
         of_draws = scan.without_model(c, fitted.columns[0], draws)[1:]
         cross.append(np.concatenate([fitted.cross[:, c, :, None], of_draws], axis=2))
 
