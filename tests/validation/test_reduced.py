@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
+from pipeline.app.commands.convert import main as convert
 from pipeline.app.one_unit import unit_of_recordings
 from pipeline.evaluation.held_out.reduced import HELD
 from pipeline.output.exports import formats
@@ -17,6 +19,8 @@ from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pipeline.unit import UnitState
 
 EFFECT = {"accelerometer.quadratic_nonlinearity": [0.004, -0.003, 0.005]}
@@ -80,3 +84,15 @@ def test_header_and_validation_state_the_error_of_the_file_and_of_the_calibratio
     # adding an effect makes no file worse that cannot hold it
     (before,) = [r for r in unit(added=False)[0].validation["accelerometer"]["reduced"] if r["part"] == "diagonal"]
     assert held["rms_error"] == pytest.approx(before["rms_error"], rel=0.05)
+
+
+def test_convert_writes_the_values_of_the_run(tmp_path: Path) -> None:
+    state, _ = unit(added=True)
+    for kind, document in (("calibrations", state.calibration), ("validations", state.validation)):
+        (tmp_path / kind).mkdir()
+        (tmp_path / kind / "unit.json").write_text(json.dumps(document))
+    assert convert([str(tmp_path / "calibrations" / "unit.json"), str(tmp_path / "px4.params")]) == 0
+    texts = (tmp_path / "px4.params").read_text(), state.exports["px4.params"]
+    written, of_run = ([line for line in text.splitlines() if "\tCAL_ACC0" in line] for text in texts)
+    assert written == of_run
+    assert len(written) > 5

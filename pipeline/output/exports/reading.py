@@ -87,6 +87,7 @@ class ImportedCalibration:
     noise: dict[str, float] = field(default_factory=dict)  # the stated ones of Kalibr's four parameters
     notes: list[str] = field(default_factory=list)  # assumptions, and values that were not read
     document: dict[str, Any] | None = None  # ``calibrations/<unit>.json``, if the file is in this format
+    validation: dict[str, Any] | None = None  # ``validations/<unit>.json`` beside it: what formats that hold less get
     stated_axes: dict[str, tuple[str, ...]] = field(default_factory=dict)  # axis map of each sensor; empty: not stated
 
     @property
@@ -116,7 +117,10 @@ def read_any(
         for s, c in sensors.items():  # a published calibration has zeros for an unknown uncertainty
             if c.covariance is None or not np.any(np.diag(c.covariance) > 0.0):
                 sensors[s] = replace(c, covariance=None)
-        return ImportedCalibration(name, str(document["unit"]), sensors, document=document)
+        beside = file.parent.parent / "validations" / file.name
+        known = file.parent.name == "calibrations" and is_published(beside)
+        validation = json.loads(_text(beside)) if known else None
+        return ImportedCalibration(name, str(document["unit"]), sensors, document=document, validation=validation)
     declared = formats()[name][0]
     if not declared.read_back:
         raise InputError(f"the format {name} holds no calibration that can be read: {declared.equation}", str(file))
@@ -391,7 +395,8 @@ def convert(
         write_atomically(target, json_text(document))
         return [target], ["the noise densities and random walks"] if imported.noise else []
     try:
-        texts = export(format_name, ExportedUnit(document, with_noise(sheets, imported)), target.name)
+        unit = ExportedUnit(document, with_noise(sheets, imported), validation=imported.validation)
+        texts = export(format_name, unit, target.name)
     except KeyError as missing:
         quantity = str(missing.args[0]).replace("_", " ")
         raise ConfigurationError(
