@@ -72,6 +72,7 @@ AGAIN = 0.1  # of a face's tilt: difference between two rests on the same face
 TRANSIT = "transit"  # name and role of a move between recordings
 TRANSIT_RATE_DPS = 20.0  # as between stops
 LEAST_ANGLE_DEG = 1e-6  # below it nothing moves: rounding
+OF_A_SHEET = "listed"  # the procedure
 TABLE_PROCEDURES = ("three_axis_turns", "thermal_ramp", ONE_RECORDING)
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -152,7 +153,13 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
     }
     if procedure not in {*attitudes, FERRARIS}:
         known = ", ".join((*TABLE_PROCEDURES, *attitudes, FERRARIS))
-        raise ConfigurationError(f"no procedure is called {procedure!r}; known: {known}")
+        message = f"no procedure is called {procedure!r}; known: {known}"
+        if procedure == OF_A_SHEET:
+            message = (
+                "procedure listed is for recordings that exist, and has no course to plan or simulate; take the one "
+                f"nearest to them, as ferraris for turns by hand and multi_position for rests; known: {known}"
+            )
+        raise ConfigurationError(message)
     if procedure == FERRARIS:
         moves = _faces_and_turns(course, rng, hand_accuracy)
     else:

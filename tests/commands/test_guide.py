@@ -338,3 +338,9 @@ def test_what_cannot_be_guided_is_refused(
     monkeypatch.chdir(tmp_path)
     assert main(["guide", *arguments]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_the_sheet_of_a_campaign_is_no_recording(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["new", str(tmp_path / "bench"), "--procedure", "listed", "--sensor", "mpu6050"]) == 0
+    assert main(["guide", str(tmp_path / "bench" / "raw" / "U1" / "recordings.csv")]) == 2
+    assert "recordings.csv: this is a sheet; guide needs the recordings that it lists" in capsys.readouterr().err

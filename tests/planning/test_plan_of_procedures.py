@@ -111,3 +111,8 @@ def test_rates_beyond_the_full_scale_and_tables_without_encoders_are_noted() -> 
 def test_a_course_that_cannot_be_run_is_refused(course: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         plan_of(replace(ONE_WAY, course=course))
+
+
+def test_a_sheet_of_recordings_has_no_course_and_the_nearest_procedure_is_named() -> None:
+    with pytest.raises(ConfigurationError, match="take the one nearest to them, as ferraris for turns by hand"):
+        plan_of(replace(ONE_WAY, procedure="listed", table="hand", course={}))

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.app.config.compose import Composer
 from pipeline.app.profile_detection.recording_facts import proposed_sheet
-from tests.study.listed_recordings import Unit, at_rest, joined, turned
+from tests.study.listed_recordings import Unit, at_rest, joined, on_table, turned
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,6 +37,19 @@ def test_kinds_axes_senses_and_whole_turns_are_proposed(tmp_path: Path) -> None:
     kind, axis, angle = turns[2].split(",")[1:4]
     assert (kind, axis) == ("turn", "z")
     assert abs(float(angle) - 90.0) < 4.0
+
+
+def test_files_with_the_angle_or_rate_of_a_table_are_proposed_with_its_axis(tmp_path: Path) -> None:
+    unit = Unit(tmp_path, np.random.default_rng(3))
+    unit.write("still", "rest,,,,", *at_rest(10.0, UP))
+    for axis, logged in enumerate(("angle", "rate", "angle")):
+        on_table(unit, "ag", axis, logged)
+    proposed = [
+        proposed_sheet(tmp_path, Composer(tmp_path).unit("unit", ["sensor=mpu6050", "procedure=listed", *more]))
+        for more in ((), ("table=single_axis", "table.sense=-1"))
+    ]
+    of_tables = [[f"table_{a}.csv,table,{sign}{a}" for a in "xyz"] for sign in ("", "-")]
+    assert [text.splitlines()[1:] for text in proposed] == [["still.csv,rest", *rows] for rows in of_tables]
 
 
 def test_reversed_and_exchanged_axes_of_the_gyroscope_are_found_from_gravity(tmp_path: Path) -> None:

@@ -128,6 +128,8 @@ def _source(arguments: argparse.Namespace) -> Source:
     files = tuple(arguments.files)
     if campaign is not None and not (arguments.sensor or arguments.procedure or arguments.ingest):
         loaded = load_campaign({"campaign": str(campaign)})
+        if first.name in {unit.config.procedure.sheet for unit in loaded.units.values()}:
+            raise ConfigurationError("this is a sheet; guide needs the recordings that it lists", str(first))
         for unit in recordings_of_files([first], loaded, [*loaded.units])[0]:
             return Source(_by_hand(loaded.units[unit].config), loaded.folder(unit), files)
     more = [f"procedure={arguments.procedure}"] if arguments.procedure else []

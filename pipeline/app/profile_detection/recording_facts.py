@@ -5,6 +5,7 @@ Propose the sheet ``recordings.csv`` for the files of a unit, from what their re
 | readings | kind |
 |---|---|
 | no time column | ``attitudes`` |
+| a table's angle or rate that changes with the rate about one axis | ``table`` |
 | at rest in one attitude; the temperature changes by 10 degC or more | ``soak``, else ``rest`` |
 | a rotation by 45 deg or more about one axis | ``turn``: whole turns where they fit, else the angle to 1 deg |
 | three rests or more | ``moves`` |
@@ -397,7 +398,7 @@ def proposed_sheet(folder: Path, settings: Settings) -> str:
                 remarks.append(f"# {path.name} cannot be read: {error.message.splitlines()[0]}")
     still = [r for r in found if _is_still(r) and r.gyroscope is not None]
     bias = median(np.array([np.asarray(r.gyroscope).mean(axis=0) for r in still])) if still else NO_RATE
-    rows += [_row(recording, bias) for recording in found]
+    rows += [_of_table(recording, bias, settings.table.sense) or _row(recording, bias) for recording in found]
     wrong = _other_axes(found, bias)
     if wrong:
         remarks.append(
@@ -421,6 +422,18 @@ def _is_still(recording: Recording) -> bool:
     u = [recording.accelerometer[r.start : r.stop].mean(axis=0) for r in rests]
     apart = [np.degrees(np.linalg.norm(v / np.linalg.norm(v) - u[0] / np.linalg.norm(u[0]))) for v in u]
     return sum(r.stop - r.start for r in rests) > RESTING_SHARE * recording.samples and max(apart) < SAME_ATTITUDE_DEG
+
+
+def _of_table(recording: Recording, bias: Values, sense: float) -> str:
+    """Return the row of a recording with the log of a table that turns about a body axis; empty for others."""
+    logged = recording.logged_rate
+    if recording.gyroscope is None or logged is None:
+        return ""
+    along = sense * logged @ (recording.gyroscope - bias)
+    axis = int(np.argmax(np.abs(along)))
+    if not np.linalg.norm(np.delete(along, axis)) < MAX_AXIS_SINE * abs(along[axis]):
+        return ""
+    return f"{recording.name},table,{'-' if along[axis] < 0.0 else ''}{AXES[axis]}"
 
 
 def _row(recording: Recording, bias: Values) -> str:
