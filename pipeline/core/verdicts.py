@@ -87,7 +87,9 @@ KINDS = {  # the most urgent first
         "not enough data", "the recordings cannot show whether an effect is missing", "record more turns or poses"
     ),
     NOT_HELD_OUT: Kind(
-        "not held out", "the error is that of the samples of the fit", "record held-out motion (validation)"
+        "not held out",
+        "the error is that of the samples of the fit",
+        "record held-out motion (validation; in a sheet, held_out=yes in the row of a file with moves or a turn)",
     ),
     BEYOND_ACCEPTANCE: Kind("fails its limits", "beyond a limit of acceptance", "see the unit's page", "bad"),
     READY: Kind("ready", "calibrated; nothing that the recordings can show is missing", "apply it", "good"),

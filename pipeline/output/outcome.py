@@ -115,7 +115,7 @@ def all_well(rows: Sequence[Mapping[str, Any] | RowState]) -> str:
     if not states or any(state.kinds for state in states):
         return ""
     ratios = [error.ratio for state in states for error in state.errors.values() if error.ratio]
-    error = f", and the error on held-out motion is at most {max(ratios):.3g} x noise" if ratios else ""
+    error = f", and the held-out error is at most {max(ratios):.3g} x noise" if ratios else ""
     who = f"All {len(rows)} units are" if len(rows) > 1 else "The unit is"
     return f"{who} ready: nothing that the recordings can show is missing{error}."
 
