@@ -294,14 +294,16 @@ class GaussMarkov:
     def whitened(self, columns: Values) -> Values:
         """Return ``R A`` with ``R^T R = C^-1`` of (m, p) columns, blocks last and in order: (g, p, m) array."""
         below = np.append(self._e, 0.0).reshape(self._half.shape)  # subdiagonal of L; T = L D L^T
-        # blocks, columns, settings: numpy is fast if the last axis is long and contiguous
-        half, phi, below = (np.ascontiguousarray(v.T) for v in (self._half, self._phi, below))
-        z = columns[self._order][:, :, None] / half[:, None, :]
-        z[1:] -= phi[:, None, :] * z[:-1]
+        # blocks first, then settings and columns: numpy is fast if the last axis is long and contiguous
+        axis = 2 if columns.shape[1] > len(below) else 1  # of the columns
+        factors = self._half, self._phi, below, np.sqrt(self._d.reshape(below.shape))
+        half, phi, below, root = (np.expand_dims(np.ascontiguousarray(v.T), axis) for v in factors)
+        z = np.expand_dims(columns[self._order], 3 - axis) / half
+        z[1:] -= phi * z[:-1]
         for k in range(1, len(z)):  # z = L^-1 w
             z[k] -= below[k - 1] * z[k - 1]
-        z /= np.sqrt(np.ascontiguousarray(self._d.reshape(self._half.shape).T))[:, None, :]
-        return np.ascontiguousarray(z.transpose(2, 1, 0))
+        z /= root
+        return np.ascontiguousarray(z.transpose(3 - axis, axis, 0))
 
     def solve(self, columns: Values) -> Values:
         """Return ``C^-1 A`` of (m, p) columns: (g, m, p) array."""
