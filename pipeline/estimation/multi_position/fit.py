@@ -28,6 +28,10 @@ the residuals show (Bartlett 1938):
 
 where h is the mean leverage of the model with the effect, over the kinds of equations in which the effect shows.
 delta BIC is the gain minus ``v log n``; p follows from chi squared with v degrees of freedom.
+
+Free curves of time imitate the wander of the bias: the most likely wander with them is too small, and the gain too
+large for chi squared. So p of curves follows from the gain under each hypothesis, and is averaged with weights in
+proportion to the restricted likelihood with the curves, as the covariance is (``judged_curves``).
 """
 
 from __future__ import annotations
@@ -38,6 +42,7 @@ from itertools import pairwise, product
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+import scipy
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.candidates import parameter_names
@@ -162,6 +167,18 @@ def _orthonormalizers(products: Values, sizes: Values) -> Values:
     return np.asarray(vectors * (kept / np.sqrt(np.where(kept, values, 1.0)))[:, None, :] / size[:, :, None])
 
 
+def log_determinants(products: Values) -> tuple[Values, int]:
+    """Return log det of (t, p, p) products of columns: (t,) array, and the number of directions in it.
+
+    Directions below ``MIN_NEW_NORM_SHARE`` under the first hypothesis are left out.
+    """
+    size = np.sqrt(np.maximum(np.einsum("tii->ti", products), 1e-300))
+    eigenvalues = np.linalg.eigvalsh(products / (size[:, :, None] * size[:, None, :]))
+    rank = int(np.sum(eigenvalues[0] > MIN_NEW_NORM_SHARE**2))
+    logarithm = np.sum(np.log(np.maximum(eigenvalues[:, products.shape[1] - rank :], 1e-300)), axis=1)
+    return np.asarray(logarithm + 2.0 * np.sum(np.log(size), axis=1)), rank
+
+
 def project_out(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -> ProjectedCandidates:
     """Whiten the equations under every hypothesis and project the model's columns out of candidates and residual."""
     model = equations.columns
@@ -180,6 +197,26 @@ def project_out(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -> 
     ]
     log_determinant = np.array([log - 2.0 * h.prior for (_, log), h in zip(whitened, hypotheses, strict=True)])
     return ProjectedCandidates(raw, factors, rest[:, :, -1], basis, log_determinant)
+
+
+def judged_curves(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -> list[tuple[float, float]]:
+    """Return delta BIC of each candidate, and p averaged over the hypotheses."""
+    projected, n = project_out(equations, hypotheses), len(equations.residual)
+    before, (best, at) = projected.scores(), projected.of_model()
+    found = []
+    for j, candidate in enumerate(equations.candidates):
+        count, after = projected.count(j, at), projected.with_candidate(j)
+        if count == 0:
+            found.append((0.0, 1.0))
+            continue
+        factor = 2.0 * projected.correction(j, at, count, equations.scatter)
+        columns = np.concatenate([equations.columns, candidate], axis=1)
+        white = np.array([equations.whitened(noise, columns)[0] for noise in hypotheses])
+        weight = scipy.special.softmax(after - 0.5 * log_determinants(white.transpose(0, 2, 1) @ white)[0])
+        p = scipy.special.chdtrc(count, factor * np.maximum(after - before, 0.0))
+        gain = factor * max(float(after.max()) - best, 0.0)
+        found.append((gain - count * float(np.log(n)), float(weight @ p)))
+    return found
 
 
 Fitted = TypeVar("Fitted")

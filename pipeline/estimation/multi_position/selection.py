@@ -32,6 +32,7 @@ from pipeline.estimation.multi_position.fit import (
     SMALL_LAST_STEP,
     FitByHand,
     fit,
+    log_determinants,
     project_out,
 )
 from pipeline.estimation.multi_position.model import Model, NoiseHypothesis, State, selection_hypotheses
@@ -344,18 +345,14 @@ def _problem(selection: SelectionByHand, effects: Mapping[str, Effect]) -> Candi
     whitened = [equations.whitened(noise, together) for noise in hypotheses]
     known = base.shape[1]
     products = np.array([white.T @ white for white, _ in whitened])
-    size = np.sqrt(np.maximum(np.einsum("tii->ti", products), 1e-300))
-    scaled = products / (size[:, :, None] * size[:, None, :])
-    eigenvalues = np.linalg.eigvalsh(scaled[:, :known, :known])
-    rank = int(np.sum(eigenvalues[0] > MIN_NEW_NORM_SHARE**2))
-    logarithm = np.sum(np.log(np.maximum(eigenvalues[:, -rank:], 1e-300)), axis=1)
-    logarithm += 2.0 * np.sum(np.log(size[:, :known]), axis=1) + np.array([log for _, log in whitened])
+    logarithm, rank = log_determinants(products[:, :known, :known])
+    logarithm += [log for _, log in whitened]
     ends = np.cumsum([0, *(Z.shape[1] for Z in columns)]).tolist()
     samples = len(equations.residual)
     return linear_problem(
         [(name, weight, slice(*span)) for (name, _, weight), span in zip(listed, pairwise(ends), strict=True)],
         without(products, np.arange(known))[:, known:, known:],
-        size[0, known:],
+        np.sqrt(np.maximum(np.diag(products[0])[known:], 1e-300)),
         np.array([h.prior for h in hypotheses]) - 0.5 * logarithm,
         ({name: term.values for name, term in fitted.items()}, selection.limits),
         excluded([*effects.values()]),

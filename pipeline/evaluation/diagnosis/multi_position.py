@@ -10,7 +10,7 @@ effect that raises the error at these rests, or after these moves, significantly
 
 The residual depends on time, temperature (powers 1 to 2 or 3 over their span) or the axis' own specific force
 (Chebyshev polynomials of degree 4 and 5) if such curves, with free coefficients on every axis, have delta BIC > 10 and
-m p < 1e-3, with m the number of all tests.
+m p < 1e-3, with m the number of all tests (``fit.judged_curves``).
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
-import scipy
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError, PipelineError
 from pipeline.core.records import Dependence, UnitRecordings
@@ -36,6 +35,7 @@ from pipeline.estimation.multi_position.fit import (
     MIN_NEW_NORM_SHARE,
     FitByHand,
     fit,
+    judged_curves,
     log_likelihoods,
     project_out,
 )
@@ -369,15 +369,9 @@ def _dependences(selection: SelectionByHand) -> list[Dependence]:
         curves.append(curve)
     equations = model.equations(selection.fits[-1].state, curves)
     possible = selection.ceilings > selection.fits[-1].log_likelihood - CEILING_TO
-    projected = project_out(equations, [selection.hypotheses[i] for i in np.flatnonzero(possible)])
-    before, setting = projected.of_model()
-    results = []
-    for j, (covariate, _) in enumerate(tests):
-        count = projected.count(j, setting)
-        factor = projected.correction(j, setting, count, equations.scatter) if count else 0.0
-        gain = factor * max(2.0 * (float(projected.with_candidate(j).max()) - before), 0.0)
-        delta, p = gain - count * float(np.log(len(equations.residual))), scipy.special.chdtrc(max(count, 1), gain)
-        results.append((covariate, delta, float(p)))
+    hypotheses = [selection.hypotheses[i] for i in np.flatnonzero(possible)]
+    judged = judged_curves(equations, hypotheses)
+    results = [(covariate, delta, p) for (covariate, _), (delta, p) in zip(tests, judged, strict=True)]
     found = [Dependence(name, p) for name, (_, p) in significant(results).items()]
     return found[:1] if found and found[0].covariate in {LAG, HYSTERESIS} else found
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import chdtrc, fdtrc
 
-from pipeline.estimation.gauss_markov import Setting
-from pipeline.estimation.multi_position.fit import project_out
+from pipeline.estimation.gauss_markov import Setting, selection_grid
+from pipeline.estimation.multi_position.fit import judged_curves, project_out
 from pipeline.estimation.multi_position.model import Equations, NoiseHypothesis
 
 WHITE = [NoiseHypothesis(Setting(0.0, 1.0), (0.0,))]
@@ -55,3 +57,34 @@ def test_a_candidate_that_the_base_holds_shows_nothing() -> None:
     base = rng.standard_normal((30, 9))
     found = project_out(equations_of(rng.standard_normal(30), base, base[:, :2] @ rng.standard_normal((2, 3))), WHITE)
     assert found.count(0, 0) == 0
+
+
+def p_of_curves(swing: float, draws: int) -> np.ndarray:
+    """Return p of a cubic of time over 40 rests whose wander, twice their noise, lies between those of the grid.
+
+    ``swing``: amplitude over the wander.
+    """
+    rng, m = np.random.default_rng(9), 40
+    time = 6.0 * np.arange(m)
+    u = time / time[-1]
+    shapes = np.stack([u, u**2, u**3], axis=1)
+    wander = 2.0 * np.linalg.cholesky(np.exp(-np.abs(time[:, None] - time) / 100.0))
+    hypotheses = [NoiseHypothesis(setting, (0.0,)) for setting in selection_grid(None, (0.3, 1.0, 3.0, 10.0))]
+    found = []
+    for _ in range(draws):
+        r = wander @ rng.standard_normal(m) + rng.standard_normal(m) + 2.0 * swing * np.sin(2.0 * np.pi * u)
+        one = equations_of(r, np.ones((m, 1)), shapes)
+        bias = np.concatenate([np.eye(m)[None], np.zeros((2, m, m))])
+        times = {"start": time, "length": np.full(m, 4.0), "joined": np.ones((m, m), bool)}
+        found.append(judged_curves(replace(one, bias=bias, **times), hypotheses)[0][1])
+    return np.array(found)
+
+
+def test_curves_of_time_are_rare_beside_a_wander() -> None:
+    p = p_of_curves(0.0, 200)
+    assert np.mean(p < 0.01) < 0.05  # of the most likely wander with the curves alone: 0.5 and more
+    assert p.min() > 2e-4
+
+
+def test_a_swing_of_many_wanders_is_no_wander() -> None:
+    assert p_of_curves(12.0, 10).max() < 1e-4
