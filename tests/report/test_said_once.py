@@ -131,7 +131,7 @@ def test_units_are_counted_once_by_their_most_urgent_problem() -> None:
 def test_a_campaign_whose_units_are_ready_says_so() -> None:
     row = {"unit": "U1", "serial": "S", "status": "ok", "accelerometer_verdict": "nothing_missing"}
     row |= {"accelerometer_error_after": 0.0103, "accelerometer_noise_floor": 0.01}
-    said = "All 2 units are ready: nothing that the recordings can show is missing, and the error on held-out motion is"
+    said = "All 2 units are ready: nothing that the recordings can show is missing, and the held-out error is"
     assert f"{said} at most 1.03 × noise." in Text(campaign_page.render("bench", [row, row | {"unit": "U2"}], [])).text
 
 
