@@ -87,6 +87,12 @@ def test_no_unit_turns_faster_than_the_earth() -> None:
 def test_noise_far_beyond_the_sensor_file_is_no_cause_but_another_sensor() -> None:
     found = without_impossible(bias_temperature(0.5), case_of(white=10.0 * WHITE))
     assert_no_cause(found, "bias_temperature", "not that of this sensor")
+    on_table = case_of(white=10.0 * WHITE)
+    turns = [replace(r, name="gyro_x", role="gyroscope") for r in on_table.recordings]
+    slower = bias_temperature(0.5)
+    assert (
+        without_impossible(slower, replace(on_table, recordings=turns)) is slower
+    )  # its rests hold the table's motion
 
 
 def test_moves_that_scatter_far_beyond_the_noise_are_unexplained() -> None:

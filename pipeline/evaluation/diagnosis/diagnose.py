@@ -8,8 +8,9 @@ Find the selected effects that are no possible cause of the residual, with the r
     beyond the sensor file      |p| - 1.96 u > 3 limit, unless the settings accept it
     by the thermometer          the temperature changes by less than its resolution
     by the Earth                a rate of more than the Earth's, 15.04 deg/h
-    by the noise                white noise of more than 3 times what the sensor's file states: that of another sensor
-                                (``generic`` is of no sensor, and states none)
+    by the noise                white noise at rest of more than 3 times what the sensor's file states: that of another
+                                sensor (``generic`` is of no sensor, and states none). Short rests of a table's turns
+                                hold its motion, too, and say nothing
 
 Such effects fit best, and are listed as ``candidates``; the verdict is ``unexplained`` and nothing is offered.
 
@@ -139,12 +140,18 @@ def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
         if span < resolution:
             return f"the temperature changes by {span:.2g} degC, less than its resolution of {resolution:.2g} degC"
     used = [r for r in case.recordings if r.reading(case.sensor) is not None]
-    density = sheet.stated("noise_density")
+    density = sheet.stated("noise_density") if _shows_its_own_noise(case) else None
     if density is not None and case.noise is not None and case.noise.step is None and used:
         excess = float(np.min(case.noise.white)) / (density * float(np.sqrt(0.5 / used[0].interval)))
         if excess > TIMES_POSSIBLE:
             return f"the noise is {excess:.2g} times the sensor file's, so that the file is not that of this sensor"
     return ""
+
+
+def _shows_its_own_noise(case: DiagnosisInput) -> bool:
+    """Return whether the noise is that of a static recording, or of rests by hand."""
+    source = "" if case.noise is None else case.noise.source
+    return source == "static" or (source == "rests" and is_multi_position(case.sensor, case.recordings))
 
 
 def _temperatures(recordings: list[Recording]) -> tuple[float, float]:
