@@ -39,7 +39,7 @@ from pipeline.checks.reference import check_motion, check_turns
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Note
 from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.physics.kinematics import normal_gravity_g
-from pipeline.physics.signal.quiet_motion import coarse_of, rounding_of, step_and_noise
+from pipeline.physics.signal.quiet_motion import rounding_of, step_and_noise
 from pipeline.physics.signal.rests import settling_of
 
 if TYPE_CHECKING:
@@ -221,9 +221,9 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
     noted = list(recordings)
     for sensor in SENSORS:
         own = [k for k, r in enumerate(recordings) if r.reading(sensor) is not None]
-        found = [step_and_noise(np.asarray(recordings[k].reading(sensor))) for k in own]
-        steps, rounding = coarse_of(found), np.sqrt(3.0) * rounding_of(found)  # half-width of a rectangle
+        steps, rounding = rounding_of([step_and_noise(recordings[k], sensor) for k in own])
         for step in np.unique(steps[steps > 0.0]):
+            off = np.sqrt(3.0) * rounding[steps == step].max()  # half-width of a rectangle
             axes = ", ".join(name for name, s in zip(TRIADS[sensor], steps, strict=True) if s == step)
             digits = next(
                 (f", {d} decimal{'s' * (d != 1)}," for d in range(MAX_SIGNIFICANT_DIGITS) if _is_whole(step * 10.0**d)),
@@ -231,7 +231,7 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
             )
             detail = (
                 f"{axes}: steps of {step:.3g} {SENSOR_UNITS[sensor]}{digits} and noise of less than half a step: "
-                f"means are off by up to {rounding[steps == step].max():.3g} {SENSOR_UNITS[sensor]}, however long the "
+                f"means are off by up to {off:.3g} {SENSOR_UNITS[sensor]}, however long the "
                 "recording, and effects of this size cannot be distinguished from rounding. Log more digits, or set a "
                 "smaller range"
             )

@@ -273,17 +273,12 @@ def rests_of(
     return replace(found, held_out=np.array([key in held for key in keys], bool)) if len(found.time) else None
 
 
-@once
-def _step_and_noise(recording: Recording, sensor: str) -> tuple[Values, Values]:
-    return step_and_noise(np.asarray(recording.reading(sensor)))
-
-
 def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, Sequence[Rest]]) -> Rests:
     """Gather rests of some recordings, which ``chosen`` has by their index; none is held out."""
     parts = {index: _of_recording(recordings[index], sensor, tuple(rests)) for index, rests in chosen.items()}
     columns = {name: np.concatenate([part[name] for part in parts.values()]) for name in next(iter(parts.values()))}
     columns["recording"] = np.repeat([*parts], [len(part["time"]) for part in parts.values()])
-    rounding = rounding_of([_step_and_noise(r, sensor) for r in recordings if r.reading(sensor) is not None])
+    _, rounding = rounding_of([step_and_noise(r, sensor) for r in recordings if r.reading(sensor) is not None])
     columns["rounding"] = np.tile(rounding, (len(columns["time"]), 1))
     shared = len(np.unique(columns["recording"])) == 1 or all(recordings[index].clock_shared for index in chosen)
     return Rests(**columns, clock_shared=shared, kinds=frozenset(recordings[index].kind for index in chosen))

@@ -200,7 +200,7 @@ class Noise:
     turns about a local polynomial) or ``data_sheet`` (the sensor file). ``length`` is the duration, s, of the static
     rest, or of all rests by hand that show the wander, else 0; the relative uncertainty of the wander is about
     ``sqrt(correlation_time / length)``. ``likelihood`` is None without a static recording. ``step``: of the readings of
-    each axis, where it hides the noise (``pipeline.physics.signal.quiet_motion.coarse_of``); else None. ``rounding``:
+    each axis, where it hides the noise (``pipeline.physics.signal.quiet_motion.rounding_of``); else None. ``rounding``:
     the standard uncertainty of means by these steps.
     """
 

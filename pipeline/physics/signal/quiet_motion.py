@@ -237,12 +237,14 @@ def counts_of(differences: Values) -> Values:
     return np.asarray(np.where(np.isfinite(smallest), smallest, 0.0))
 
 
-def step_and_noise(values: Values) -> tuple[Values, Values]:
-    """Return the step and the noise of each axis of a recording's (n, 3) readings; infinite where unknown.
+@once
+def step_and_noise(recording: Recording, sensor: str) -> tuple[Values, Values]:
+    """Return the step and the noise of each axis of a sensor's readings; infinite where unknown.
 
     The noise is the first quartile of the white noise of blocks, that of the quietest.
     """
     unknown = np.full(3, np.inf)
+    values = np.asarray(recording.reading(sensor))
     differences = np.abs(np.diff(values[np.isfinite(values).all(axis=1)], axis=0))
     count = len(differences) // DIFFERENCE_BLOCK
     if count < MIN_DIFFERENCE_BLOCKS:
@@ -253,33 +255,23 @@ def step_and_noise(values: Values) -> tuple[Values, Values]:
     return np.where(step > 0.0, step, np.inf), noise
 
 
-def coarse_of(found: Sequence[tuple[Values, Values]]) -> Values:
-    """Return the step of the readings on each axis whose noise is below half a step, 0 on the others: (3,) array.
+def rounding_of(found: Sequence[tuple[Values, Values]]) -> tuple[Values, Values]:
+    """Return the step of coarse readings, and the standard uncertainty of their means by rounding: (3,) arrays.
 
-    ``found``: ``step_and_noise`` of each recording; the quietest counts. White noise s in steps of d scatters by
-    ``sqrt(s^2 + d^2 / 12)``, 0.58 d for half a step; with less, a mean has a rounding error (``rounding_of``), however
-    many readings it has.
+    Both are 0 on an axis whose noise is above half a step. ``found``: ``step_and_noise`` of each recording; the
+    quietest counts. White noise s in steps of d scatters by ``sqrt(s^2 + d^2 / 12)``, 0.58 d for half a step. For a
+    value anywhere in a step, ``u^2 = d^2 / (2 pi^2) sum_k exp(-(2 pi k s / d)^2) / k^2``, however many readings a mean
+    has: ``d^2 / 12`` without noise and 4e-6 d^2 for half a step (Widrow & Kollar 2008, Quantization Noise: by the
+    characteristic function of the noise).
     """
     unknown = np.full(3, np.inf), np.full(3, np.inf)
     step, noise = (np.min(values, axis=0) for values in zip(unknown, *found, strict=True))
-    return np.asarray(np.where(np.isfinite(step) & (noise < COARSE * step), step, 0.0), np.float64)
-
-
-def rounding_of(found: Sequence[tuple[Values, Values]]) -> Values:
-    """Return the standard uncertainty of means of coarse readings by rounding, 0 for other axes: (3,) array.
-
-    ``found``: ``step_and_noise`` of the recordings. Of white noise s in steps d, for a value anywhere in a step:
-    ``u^2 = d^2 / (2 pi^2) sum_k exp(-(2 pi k s / d)^2) / k^2``, which is ``d^2 / 12`` without noise and 4e-6 d^2 for
-    half a step (Widrow & Kollar 2008, Quantization Noise: by the characteristic function of the noise).
-    """
-    step = coarse_of(found)
-    noise = np.min([np.full(3, np.inf), *(noise for _, noise in found)], axis=0)
-    coarse, u = step > 0.0, np.zeros(3)
+    coarse, u = np.isfinite(step) & (noise < COARSE * step), np.zeros(3)
     k = np.arange(1, ROUNDING_TERMS + 1)[:, None]
     variance = np.maximum((noise[coarse] / step[coarse]) ** 2 - 1.0 / 12.0, 0.0)  # s^2 / d^2 (Sheppard 1898)
     harmonics = np.sum(np.exp(-((2.0 * np.pi * k) ** 2) * variance) / k**2, axis=0)
     u[coarse] = step[coarse] * np.sqrt(0.5 * harmonics) / np.pi
-    return u
+    return np.where(coarse, step, 0.0), u
 
 
 def windows(values: Values, size: int) -> tuple[Values, Values]:

@@ -40,6 +40,6 @@ def test_the_rounding_error_of_a_mean_is_that_of_values_anywhere_in_a_step(noise
     noisy = value[:, None] + noise * step * rng.standard_normal((50, 40_000))
     error = (step * np.round(noisy / step)).mean(axis=1) - value
     scatter = np.hypot(noise * step, step / np.sqrt(12.0))  # of the readings, over all values
-    u = rounding_of([(np.full(3, step), np.full(3, scatter))])
+    _, u = rounding_of([(np.full(3, step), np.full(3, scatter))])
     allowance = 0.002 * step  # the mean of 40,000 readings with noise of 0.4 steps scatters by as much
     assert np.sqrt(np.mean(error**2)) == pytest.approx(u[0], rel=0.03, abs=allowance)
