@@ -417,14 +417,14 @@ def turns_of(
     chosen = stated_turns(recordings, rests, procedure, role)
     if not chosen:
         return None
-    found = _gathered(recordings, chosen, accelerometer)
-    return replace(found, frame=float(np.radians(frame_deg)), by_length=procedure.sheet is not None)
+    found = _gathered(recordings, chosen, accelerometer, float(np.radians(frame_deg)))
+    return replace(found, by_length=procedure.sheet is not None)
 
 
 def _gathered(
-    recordings: Sequence[Recording], chosen: Sequence[StatedTurn], accelerometer: SensorCalibration | None
+    recordings: Sequence[Recording], chosen: Sequence[StatedTurn], accelerometer: SensorCalibration | None, frame: float
 ) -> TurnsByHand:
-    """Return the samples of turns, and their equations."""
+    """Return the samples of turns, and their equations; ``frame``: of ``TurnsByHand``."""
     pairs = [(recordings[t.recording], at) for t, at in zip(chosen, padded([t.span for t in chosen]), strict=True)]
     force = [
         np.zeros((len(at), 3))
@@ -460,7 +460,7 @@ def _gathered(
         rows=np.array(rows),
         value=np.array(value),
         error=np.array(error),
-        frame=0.0,
+        frame=frame,
     )
 
 

@@ -203,16 +203,18 @@ def judged_curves(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -
     """Return delta BIC of each candidate, and p averaged over the hypotheses."""
     projected, n = project_out(equations, hypotheses), len(equations.residual)
     before, (best, at) = projected.scores(), projected.of_model()
+    together = np.concatenate([equations.columns, *equations.candidates], axis=1)
+    products = np.array([white.T @ white for white in (equations.whitened(h, together)[0] for h in hypotheses)])
+    known, edges = equations.columns.shape[1], np.cumsum([0, *(c.shape[1] for c in equations.candidates)])
     found = []
-    for j, candidate in enumerate(equations.candidates):
+    for j, span in enumerate(pairwise((known + edges).tolist())):
         count, after = projected.count(j, at), projected.with_candidate(j)
         if count == 0:
             found.append((0.0, 1.0))
             continue
         factor = 2.0 * projected.correction(j, at, count, equations.scatter)
-        columns = np.concatenate([equations.columns, candidate], axis=1)
-        white = np.array([equations.whitened(noise, columns)[0] for noise in hypotheses])
-        weight = scipy.special.softmax(after - 0.5 * log_determinants(white.transpose(0, 2, 1) @ white)[0])
+        own = np.r_[:known, slice(*span)]
+        weight = scipy.special.softmax(after - 0.5 * log_determinants(products[:, own[:, None], own])[0])
         p = scipy.special.chdtrc(count, factor * np.maximum(after - before, 0.0))
         gain = factor * max(float(after.max()) - best, 0.0)
         found.append((gain - count * float(np.log(n)), float(weight @ p)))

@@ -237,8 +237,7 @@ def gravity_direction(
     model = GyroscopeModel(judged, moves_of(recordings, judged), gravity, noise, fewest=1, turns=turns)
     if model.moves is None:
         return {"reason": "no move is held out"}
-    terms = tuple(EffectColumns(effect(e.name), e.values) for e in gyroscope.effects)
-    states = {"before": State(np.zeros(3), np.eye(3)), "after": State(gyroscope.bias, gyroscope.matrix, terms)}
+    states = {"before": State(np.zeros(3), np.eye(3)), "after": _state(gyroscope)}
     errors = {name: model.direction_errors(state) for name, state in states.items()}
     found: dict[str, Any] = {"reason": None, "moves": model.moves.count}
     found["mean_deg"] = {name: float(np.mean(error)) for name, (error, _) in errors.items()}
@@ -285,8 +284,7 @@ def turn_departures(
     )
     if turns is None:
         return ()
-    terms = tuple(EffectColumns(effect(e.name), e.values) for e in gyroscope.effects)
-    block = turns.equations(State(gyroscope.bias, gyroscope.matrix, terms), white_of(rests, noise))
+    block = turns.equations(_state(gyroscope), white_of(rests, noise))
     J = block.base * block.error[:, None]
     between = np.average(rests.reading, axis=0, weights=rests.count) - gyroscope.bias
     wander = np.zeros(3) if noise is None else noise.wander
@@ -294,3 +292,11 @@ def turn_departures(
     deviation = np.sqrt(variance + J[:, BIAS] ** 2 @ (between**2 + wander**2))
     deviation[len(turns.name) :] = np.inf  # the axes refer to the case, of whose angles to the frame nothing is known
     return tuple(turns.departures(block.residual * block.error, deviation))
+
+
+def _state(calibration: SensorCalibration) -> State:
+    return State(
+        calibration.bias,
+        calibration.matrix,
+        tuple(EffectColumns(effect(e.name), e.values) for e in calibration.effects),
+    )
