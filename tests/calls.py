@@ -1,7 +1,9 @@
-"""Which functions are called, and how often: of the steps of a unit, and of what is computed once a unit."""
+"""Which functions are called, and how often, of a unit's steps and of what is computed once; what code imports."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections import Counter
 from contextlib import contextmanager
 from importlib import import_module
@@ -76,3 +78,10 @@ def designs() -> Iterator[Counter[tuple[Any, ...]]]:
 def names(calls: Calls) -> set[str]:
     """Return the names of the called functions."""
     return {name for name, _ in calls}
+
+
+def imported_by(code: str, *packages: str) -> list[str]:
+    """Return the modules of some packages that a new interpreter has imported after it has run the code."""
+    listed = f"import sys; print(*(m for m in sys.modules if m.split('.')[0] in {packages!r}))"
+    done = subprocess.run([sys.executable, "-c", f"{code}\n{listed}"], capture_output=True, text=True, check=True)
+    return done.stdout.split()

@@ -3,12 +3,12 @@
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from calls import imported_by
 
 from pipeline.app.steps.job_server import COMMAND, start_server
 
@@ -64,12 +64,8 @@ def test_without_a_server_the_command_runs_the_stage(tmp_path: Path, monkeypatch
 
 
 def test_the_server_imports_no_pandas() -> None:
-    code = (
-        "import sys; from pipeline.app.steps.job_server import _prepare; _prepare();"
-        "print([m for m in ('pandas', 'matplotlib', 'hydra', 'snakemake') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    code = "from pipeline.app.steps.job_server import _prepare; _prepare()"
+    assert imported_by(code, "pandas", "matplotlib", "hydra", "snakemake") == []
 
 
 def _process_in(folder: Path, but: int = 0) -> int:
