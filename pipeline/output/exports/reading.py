@@ -44,14 +44,7 @@ from pipeline.core.records import (
 )
 from pipeline.ingest.axis_maps import STRAIGHT, maps_of_log
 from pipeline.output.exports import ExportedUnit, export, formats, text_of
-from pipeline.output.exports.sensors import (
-    SI,
-    TEMPLATE_FUNCTIONS,
-    UNIT_FACTORS,
-    ExportedSensor,
-    SensorFigures,
-    before_use,
-)
+from pipeline.output.exports.sensors import SI, TEMPLATE_FUNCTIONS, UNIT_FACTORS, SensorFigures, before_use
 from pipeline.output.exports.text_kinds import Expressions, Node, parsed
 from pipeline.physics.calibration_file import read_calibration, sensor_of
 from pipeline.physics.compensation import Compensation
@@ -411,15 +404,15 @@ def convert(
     files = [target.with_name(name) for name in texts]
     for file, text in zip(files, texts.values(), strict=True):
         write_atomically(file, text)
-    return files, lost(imported, format_name, files[0], sheets)
+    return files, lost(imported, format_name, files[0], unit)
 
 
-def lost(imported: ImportedCalibration, format_name: str, file: Path, sheets: Mapping[str, SensorFigures]) -> list[str]:
+def lost(imported: ImportedCalibration, format_name: str, file: Path, unit: ExportedUnit) -> list[str]:
     """Read a written file back, and return the losses in sentences."""
     declared = formats()[format_name][0]
     if not declared.read_back:
         return [f"bias and matrix: {format_name} is for {declared.equation}"]
-    back = read_any(file, format_name, counts_of(sheets))
+    back, exported = read_any(file, format_name, counts_of(unit.sheets)), unit.sensors(declared)
     lines = []
     if back.axis_maps != imported.axis_maps:
         maps = ", ".join(f"{s} {' '.join(m)}" for s, m in imported.axis_maps.items())
@@ -428,12 +421,10 @@ def lost(imported: ImportedCalibration, format_name: str, file: Path, sheets: Ma
         if s not in back.sensors:
             lines.append(f"{s}: all of it; {format_name} holds no {s}")
             continue
-        lines += [
-            f"{s}: {line}"
-            for line in _differences(calibration, back.sensors[s], all_effects=declared.effects == ["all"])
-        ]
-        exported = ExportedSensor(calibration, declared.units[s], None)
-        lines += [f"{s}: {line}" for line in exported.left_by_matrix(declared.matrix.get(s, "full"))]
+        told = _differences(
+            calibration, back.sensors[s], all_effects=declared.effects == ["all"], fitted=exported[s].held is not None
+        )
+        lines += [f"{s}: {line}" for line in (*told, *exported[s].left_by_matrix(declared.matrix.get(s, "full")))]
     if imported.noise and not back.noise:
         lines.append("the noise densities and random walks")
     if any(c.covariance is not None for c in imported.sensors.values()):
@@ -443,14 +434,16 @@ def lost(imported: ImportedCalibration, format_name: str, file: Path, sheets: Ma
     return lines
 
 
-def _differences(before: SensorCalibration, after: SensorCalibration, *, all_effects: bool) -> list[str]:
-    """Return the differences of bias, matrix and effects in sentences."""
+def _differences(before: SensorCalibration, after: SensorCalibration, *, all_effects: bool, fitted: bool) -> list[str]:
+    """Return the differences of bias, matrix and effects in sentences; ``fitted``: whether both are fitted anew."""
     unit = SENSOR_UNITS[before.sensor]
     bias, matrix = (np.abs(getattr(after, key) - getattr(before, key)).max() for key in ("bias", "matrix"))
     lines = []
     if bias > CONVERSION_TOLERANCE:
         left_out = np.any(before.bias) and not np.any(after.bias)
-        lines.append("the bias" if left_out else f"the bias is rounded, by up to {bias:.2g} {unit}")
+        lines.append(
+            "the bias" if left_out else f"the bias {'changes' if fitted else 'is rounded,'} by up to {bias:.2g} {unit}"
+        )
     if matrix > CONVERSION_TOLERANCE:
         lines.append(f"elements of the matrix change by up to {matrix:.2g}")
     values = {e.name: e.values for e in after.effects}
