@@ -20,14 +20,16 @@ EFFECTS = (
 
 
 def document(
-    unit: str, values: np.ndarray, effects: tuple[FittedEffect, ...] = (), lack: float = 0.0
+    unit: str, values: np.ndarray, effects: tuple[FittedEffect, ...] = (), lack: float = 0.0, fixed: slice = slice(0)
 ) -> dict[str, Any]:
     """Return a calibration as it is published, whose bench contributes three times what its readings do.
 
-    ``lack``: how much of the readings' standard uncertainty is lack of fit.
+    ``lack``: how much of the readings' standard uncertainty is lack of fit. ``fixed``: parameters that the method does
+    not estimate.
     """
-    size = len(values)
-    own, bench = OWN_U**2 * np.eye(size), BENCH_U**2 * np.eye(size)
+    size, estimated = len(values), np.ones(len(values))
+    estimated[fixed] = 0.0
+    own, bench = OWN_U**2 * np.diag(estimated), BENCH_U**2 * np.diag(estimated)
     lines = [
         Contribution(
             "noise of the readings",
@@ -45,7 +47,7 @@ def document(
     )
     found = SensorCalibration(
         SENSOR, values[:3], values[3:12].reshape(3, 3), effects=fitted, covariance=own + bench,
-        freedom=np.full(size, 50.0 * 10.0**2), degrees_of_freedom=5000.0,
+        freedom=np.where(estimated, 50.0 * 10.0**2, np.inf), degrees_of_freedom=5000.0,
         budget=Budget(tuple(line.line() for line in lines), ()),
     )  # fmt: skip
     same = {"sensor": "mpu6050", "table": "t", "procedure": "p", "methods": {SENSOR: "m"}}
@@ -110,6 +112,19 @@ def test_the_budget_states_what_the_lot_contributes() -> None:
         "lot": "mpu6050, lot 7", "sensor": SENSOR, "units": [f"U{i}" for i in range(20)], "with_prior": 20,
         "outliers": [], "without": {},
     }  # fmt: skip
+
+
+def test_a_lot_whose_method_keeps_elements_fixed_has_a_prior_for_the_others() -> None:
+    _, x = lot(np.random.default_rng(5), 12)
+    x[:, 4:7] = TRUTH[4:7]
+    documents = [document(f"U{k}", values, fixed=slice(4, 7)) for k, values in enumerate(x)]
+    (estimate,) = estimates({"lot": "7"}, documents[0], {})
+    assert np.isfinite(estimate.freedom).all()  # JSON has neither NaN nor infinity
+    for (found, prior), values in zip(with_priors(documents)[0], x, strict=True):
+        assert not prior.refused
+        assert np.ravel(found[SENSOR]["matrix"])[1:4].tolist() == values[4:7].tolist()
+        assert np.ravel(found[SENSOR]["expanded_uncertainty"]["matrix"])[1:4].tolist() == [0.0, 0.0, 0.0]
+        assert found[SENSOR]["bias"] != values[:3].tolist()
 
 
 def test_the_lack_of_fit_is_not_reduced_as_siblings_may_share_it() -> None:

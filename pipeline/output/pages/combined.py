@@ -286,7 +286,9 @@ def _divided(fit: SensorCalibration) -> tuple[Values, Values, tuple[Values, Valu
     own, shared = own_and_bench(fit, LACK_OF_FIT)
     total = np.maximum(np.diag(own + shared), 1e-300)
     of_readings, of_own = np.diag(readings) / total, np.diag(own) / total
-    freedom, lack = fit.parameters.degrees_of_freedom * of_readings**2, of_readings - of_own
+    effective, lack = fit.parameters.degrees_of_freedom, of_readings - of_own
+    fixed = np.full(len(effective), np.inf)  # elements that a method does not estimate
+    freedom = np.multiply(effective, of_readings**2, out=fixed, where=of_readings > 0.0)
     of_shared = np.divide(freedom * (1.0 - of_own) ** 2, lack**2, out=np.full(len(lack), np.inf), where=lack > 1e-6)
     return own, shared, (freedom, of_shared)
 
