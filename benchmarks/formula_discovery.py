@@ -38,10 +38,10 @@ from typing import Any
 
 import numpy as np
 
+from imu_research.figures import wilson
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import CYCLE_DEGC, NOISES, StudyCase, draw
 from imu_research.study.run import held_out_errors
-from imu_research.study.scores import wilson
 from pipeline.app.one_unit import ConfiguredUnit, unit_of_recordings
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS, Recording

@@ -29,11 +29,20 @@ seeds   simulates the campaign's recordings with every seed and writes FILE (dat
 
 def study(argv: Sequence[str]) -> int:
     """Run the blind study of the diagnosis: hide random effects, diagnose the units, and count correct answers."""
+    from imu_research.figures import write_figures  # noqa: PLC0415
     from imu_research.study.cases import FAMILIES  # noqa: PLC0415  (not needed for a comparison with the thesis)
     from imu_research.study.page import DIAGRAM, page  # noqa: PLC0415
     from imu_research.study.result import cases_of  # noqa: PLC0415
     from imu_research.study.run import RESULTS_FILE, TRUTH_FILE, read_lines, run_study  # noqa: PLC0415
-    from imu_research.study.scores import accepted, answer_scores, family_scores, reliability_diagram  # noqa: PLC0415
+    from imu_research.study.scores import (  # noqa: PLC0415
+        PROBABILITIES,
+        accepted,
+        answer_scores,
+        false_selection_rates,
+        family_scores,
+        reliability,
+        reliability_diagram,
+    )
     from pipeline.app.run_progress import Countdown  # noqa: PLC0415
 
     parser = parser_of("study", study.__doc__, STUDY.format(", ".join(FAMILIES)))
@@ -45,6 +54,7 @@ def study(argv: Sequence[str]) -> int:
     parser.add_argument("--processes", type=int, default=1, help="processor cores (default: 1)")
     words = "write the study as a Markdown page, and its diagram to the folder images/ next to it"
     parser.add_argument("--table", type=Path, metavar="FILE", help=words)
+    parser.add_argument("--figures", type=Path, metavar="FILE", help="write the scores as JSON")
     arguments = parser.parse_args(argv)
     families = _families(arguments.families, FAMILIES)
     countdown = Countdown(0)
@@ -58,7 +68,11 @@ def study(argv: Sequence[str]) -> int:
     )
     countdown.end()
     cases = cases_of(read_lines(arguments.directory / TRUTH_FILE), read_lines(arguments.directory / RESULTS_FILE))
-    for score in [*accepted(cases), *family_scores(cases), *answer_scores(cases)]:
+    scores = [*accepted(cases), *family_scores(cases), *answer_scores(cases)]
+    if arguments.figures:
+        stated = [f._replace(name=f"{of}, stated {f.name}") for of in PROBABILITIES for f in reliability(cases, of)]
+        write_figures(arguments.figures, [*scores, *false_selection_rates(cases), *stated])
+    for score in scores:
         name, n, value, interval, goal = score.cells
         print(f"{name:<92} {n:>5} {value:>8} {interval:<16} {goal:<9} {' '.join(score.misses[:8])}".rstrip())
     if arguments.table:

@@ -83,12 +83,14 @@ def recordings_of(case: StudyCase) -> list[Recording]:
         }
         for sensor in SENSORS
     }
-    course = {"positions": case.rests} if case.rests else COURSES.get(case.procedure, COURSES["stop_and_go"])
+    course = COURSES.get(case.procedure, COURSES["stop_and_go"])
+    if case.by_hand:
+        course = {"positions": case.rests} if case.rests else {}
     unit = UnitDescription(
         "unit",
         sensor=case.model,
         table=case.table,
-        procedure="multi_position" if case.rests else "three_axis_turns",
+        procedure=case.procedure if case.by_hand else "three_axis_turns",
         course=course,
         interval_s=_interval(case),
         lost=0.1 if case.noise == "lost" else 0.0,
@@ -145,7 +147,7 @@ def _with_noise(
 
 
 def _interval(case: StudyCase) -> float:
-    return INTERVAL_BY_HAND_S if case.rests else INTERVAL_S
+    return INTERVAL_BY_HAND_S if case.by_hand else INTERVAL_S
 
 
 def _white(data_sheet: DataSheet) -> float:
@@ -183,8 +185,8 @@ def _added(recording: Recording, sensor: str, values: Values) -> Recording:
 
 
 def signals_left(case: StudyCase) -> dict[str, float]:
-    """Return lambda of each hidden effect; empty where the true noise is not white noise and Gauss-Markov wander."""
-    if not case.hidden or case.noise not in GAUSS_MARKOV:
+    """Return lambda of each hidden effect; empty by hand, or for other noise than white and Gauss-Markov."""
+    if not case.hidden or case.by_hand or case.noise not in GAUSS_MARKOV:
         return {}
     recordings = _used(case)
 

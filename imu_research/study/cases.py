@@ -8,6 +8,7 @@ The family, the number and the study's seed determine a case. Families:
     null_<noise>         nothing; both sensors are judged
     null_sensors         nothing, in any sensor of ``sensor_files`` on any shipped table
     null_hand_<noise>    nothing, in any of them by hand, 15 to 40 rests
+    hand_<procedure>     one effect of the sensor by hand, at the sensor file's size
     unseen               an effect that the procedure cannot show
     removed              one effect, which is then removed from the catalogue
     one_axis             an effect on one axis only
@@ -49,6 +50,7 @@ FAMILIES = (
     "removed", "one_axis", *(f"shape_{shape}" for shape in SHAPES), "lost", "coarse", "cold",
     *(f"cycle_{shape}" for shape in OF_TEMPERATURE), "staged", "limit_30", "limit_60", "limit_100", "null_sensors",
     *(f"null_hand_{noise}" for noise in ("white", "normal", "wander", "random_walk")),
+    *(f"hand_{procedure}" for procedure in ("multi_position", "ferraris", "orientations_24")),
 )  # fmt: skip  # a new one goes last: its place is part of every case's random numbers
 # Long recordings at several rates, so that each observable effect can be detected.
 LONG: dict[str, Any] = {"rates_dps": (20.0, 60.0, 100.0, 200.0), "static_s": 300.0}
@@ -100,7 +102,12 @@ class StudyCase:
     room_degc: float | None = None  # swing of the room's temperature; None: the simulator's
     method: str = REFERENCE  # by which the base is calibrated
     table: str = "acutronic"  # ``hand``: rests and moves by hand
-    rests: int = 0  # by hand
+    rests: int = 0  # of multi_position
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether the unit is recorded without a table."""
+        return self.table == "hand"
 
     @property
     def key(self) -> str:
@@ -144,6 +151,12 @@ def draw(family: str, number: int, seed: int) -> StudyCase:
         return StudyCase(
             family, number, seed, model, sensor, procedure, shape=detail, amplitude=amplitude, room_degc=room
         )
+    if kind == "hand":
+        name = str(rng.choice(OF_SENSOR_BY_HAND[sensor]))
+        hidden = {name: drawn("mpu6050", sensor, name, rng).tolist()}
+        rests = int(rng.integers(RESTS_BY_HAND[0], RESTS_BY_HAND[1] + 1)) if detail == "multi_position" else 0
+        case = StudyCase(family, number, seed, "mpu6050", sensor, detail, hidden, rests=rests, table="hand")
+        return replace(case, method=METHODS_OF_HAND_HELD_CASES)
     if kind == "unseen":
         return _unseen(number, seed, rng)
     if kind == "staged":
@@ -275,6 +288,15 @@ FAINT = {
         "accelerometer": {"bias_temperature", "quadratic_nonlinearity", "cubic_nonlinearity"},
         "gyroscope": {"bias_temperature"},
     },
+}
+OF_SENSOR_BY_HAND = {  # effects of the sensor that rests in many attitudes, or moves between them, can show
+    "accelerometer": (
+        "scale_factor_asymmetry",
+        "quadratic_nonlinearity",
+        "cubic_nonlinearity",
+        "cross_axis_nonlinearity",
+    ),
+    "gyroscope": ("scale_factor_asymmetry", "g_sensitivity", "g_squared_sensitivity"),
 }
 AT_REST = (
     "lever_arm", "inner_lever_arms", "time_offset", "low_pass_lag", "clock_rate", "vibration_rectification",

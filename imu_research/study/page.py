@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from imu_research.figures import wilson
 from imu_research.study.cases import FAINT, SIZES
 from imu_research.study.scores import (
     GATES,
-    ScoreLine,
     accepted,
     answer_scores,
     false_selections,
@@ -22,7 +22,6 @@ from imu_research.study.scores import (
     outside_answered,
     reliability,
     warned,
-    wilson,
 )
 from pipeline.core.verdicts import Verdict
 from pipeline.output.pages.pages import template
@@ -31,6 +30,7 @@ from pipeline.physics.effects import effect
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from imu_research.figures import MeasuredFigure
     from imu_research.study.result import ScoredCase
 
 TableRows = list[list[Any]]
@@ -145,7 +145,7 @@ def _outcome(case: ScoredCase) -> str:
     return "answered" if outside_answered(case) else "silent"
 
 
-def _misses(cases: Sequence[ScoredCase], scores: Sequence[ScoreLine]) -> TableRows:
+def _misses(cases: Sequence[ScoredCase], scores: Sequence[MeasuredFigure]) -> TableRows:
     by_key = {key: case for case in cases for key in (case.key, f"{case.key} {case.sensor}")}
     keys = [key for score in scores if score.goal for key in score.misses]
     rows = []

@@ -30,6 +30,7 @@ class Diagnosed:
     inflated: bool = False  # more bias wander than expected
     not_observable: list[str] = field(default_factory=list)
     answer_set: list[list[str]] | None = None  # effects of each answer, the most probable first; None: not computed
+    answer_probability: list[float] = field(default_factory=list)  # of each answer
     probability: dict[str, float] = field(default_factory=dict)
     upper_limit: dict[str, list[float]] = field(default_factory=dict)  # of the parameters of an effect
 
@@ -38,6 +39,7 @@ class Diagnosed:
         """Return the part of a line of ``truth.jsonl`` or ``results.jsonl``, or of both joined."""
         found = {key.name: line[key.name] for key in fields(cls) if key.name in line}
         if "answer_set" in found:
+            found["answer_probability"] = [answer["probability"] for answer in found["answer_set"]]
             found["answer_set"] = [answer["effects"] for answer in found["answer_set"]]
         limits = {name: of.values() for name, of in found.get("upper_limit", {}).items() if of}
         found["upper_limit"] = {name: [limit["value"] for limit in of] for name, of in limits.items()}

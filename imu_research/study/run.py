@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 TRUTH_FILE, RESULTS_FILE = "truth.jsonl", "results.jsonl"
-FAMILIES_WITH_HELD_OUT_ERRORS = ("single", "pairs", "triples", "one_axis", "shape", "cycle")
+FAMILIES_WITH_HELD_OUT_ERRORS = ("single", "pairs", "triples", "one_axis", "shape", "cycle", "hand")
 
 
 def run_study(
@@ -144,7 +144,7 @@ def diagnose_case(case: StudyCase) -> tuple[ConfiguredUnit, UnitState]:
     Raises ``PipelineError`` if a step refuses the unit.
     """
     options = {"sensor": case.model, "table": case.table, "method": case.method}
-    options |= {"procedure": case.procedure} if case.rests else {}
+    options |= {"procedure": case.procedure} if case.by_hand else {}
     unit = unit_of_recordings(recordings_of(case), [f"{group}={option}" for group, option in options.items()])
     with leaving_out(case.left_out):
         return unit, unit.run_to("diagnose")

@@ -11,12 +11,13 @@ compared with each parameter of a hidden effect that was not selected.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
 import scipy
 
+from imu_research.figures import MeasuredFigure, clustered_share, share
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.design import OTHER_PREFIX
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW
@@ -34,8 +35,9 @@ OF_WHICH = "... of those in which each stands out (lambda >= 100)"
 IN_THE_CATALOGUE = ("single", "pairs", "triples", "one_axis")
 MAY_HIDE = ("single", "small", "tiny", "one_axis", "pairs", "pairs_wander", "triples")
 LOOK_ALIKE_SIGNAL_SHARE = 0.95  # share of a signal above which effects are look-alikes, as on the pages
+HARM = 1.01  # times the held-out error before
 EXCESS = 0.05  # of the noise floor: smallest held-out excess that is counted
-GATES = (6.0, 8.0, MIN_DELTA_BIC, 12.0, 14.0, MIN_DELTA_BIC_OF_SLOW, 18.0, 20.0)  # at which false selections count
+GATES = (6.0, 8.0, MIN_DELTA_BIC, 12.0, 14.0, 16.0, 18.0, MIN_DELTA_BIC_OF_SLOW)  # at which false selections count
 OF_SENSOR_FILE = ("white", "normal")  # noise of the families that the sensor file describes
 STANDS_OUT = 100.0  # lambda: the largest that a selection needs
 DOUBTFUL_VERDICTS = (Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUBT)
@@ -61,6 +63,11 @@ def exact(case: ScoredCase) -> bool:
             return False
         selected.remove(alike)
     return not selected
+
+
+def no_other(case: ScoredCase) -> bool:
+    """Return whether nothing was selected, or the hidden effect, or its declared look-alike; no other one."""
+    return not case.selected or exact(case)
 
 
 def not_seen(case: ScoredCase) -> bool:
@@ -92,10 +99,15 @@ def hard_to_replace(case: ScoredCase) -> bool:
     return max(whole.look_alikes[name].values(), default=0.0) <= LOOK_ALIKE_SIGNAL_SHARE
 
 
+def harmless(case: ScoredCase) -> bool:
+    """Return whether what was selected does not raise the held-out error by more than 1 %."""
+    return case.held_out is not None and case.held_out.after <= HARM * case.held_out.before
+
+
 def excess_gone(case: ScoredCase) -> float | None:
     """Return the share of the held-out excess over the noise floor that was removed; None for an excess below 5 %."""
     held = case.held_out
-    if held is None or held.before < (1.0 + EXCESS) * held.floor:
+    if held is None or held.before is None or held.before < (1.0 + EXCESS) * held.floor:
         return None
     return (held.before - held.after) / (held.before - held.floor)
 
@@ -119,44 +131,12 @@ SCORED_FAMILIES: list[tuple[str, str, Callable[[ScoredCase], bool], str]] = [
     ("pairs", "two effects: exactly these", exact, ">= 95 %"),
     ("pairs_wander", "two effects, five times the wander: exactly these", exact, ">= 85 %"),
     ("triples", "three effects: exactly these", exact, ""),
+    ("hand_multi_position", "by hand, rests in 15 to 40 attitudes, one effect: no other named", no_other, ">= 98 %"),
+    ("hand_ferraris", "by hand, faces and turns, one effect: no other named", no_other, ">= 98 %"),
+    ("hand_orientations_24", "by hand, 24 orientations, one effect: no other named", no_other, ">= 98 %"),
     ("unseen", "cannot be seen: said so, and not selected", not_seen, "100 %"),
     ("removed", "taken out of the catalogue: no other one without a warning", not_silent, ">= 95 %"),
 ]
-
-
-class ScoreLine(NamedTuple):
-    """A line of a table: a share of ``total`` cases with its 95 % interval, or a mean or median without one.
-
-    ``misses`` names the cases that do not belong to the share, in order.
-    """
-
-    name: str
-    value: float
-    total: int
-    goal: str = ""
-    interval: tuple[float, float] | None = None
-    misses: tuple[str, ...] = ()
-
-    @property
-    def cells(self) -> list[Any]:
-        """Name, n, value, interval and goal as a table shows them."""
-        if self.interval is None:
-            return [self.name, self.total, f"{self.value:.2g}", "", self.goal]
-        low, high = (100.0 * end for end in self.interval)
-        return [self.name, self.total, f"{100.0 * self.value:.1f} %", f"{low:.1f} to {high:.1f} %", self.goal]
-
-
-def wilson(hits: int, total: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share."""
-    found = scipy.stats.binomtest(hits, total).proportion_ci(0.95, method="wilson")
-    return float(found.low), float(found.high)
-
-
-def share(name: str, right: pd.Series[bool], goal: str = "") -> list[ScoreLine]:
-    """Return the share of the true values, with the labels of the others as misses; an empty list for no values."""
-    hits, total = int(right.sum()), len(right)
-    misses = tuple(map(str, right.index[~right]))
-    return [ScoreLine(name, hits / total, total, goal, wilson(hits, total), misses)] if total else []
 
 
 def _judged(cases: Sequence[ScoredCase], right: Callable[[ScoredCase], bool]) -> pd.Series[bool]:
@@ -174,15 +154,15 @@ def family_of(case: ScoredCase) -> str:
     return "null" if case.family.startswith("null") else case.family
 
 
-def accepted(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
+def accepted(cases: Sequence[ScoredCase]) -> list[MeasuredFigure]:
     """Return the share of the units that no step of a run refused."""
     taken = pd.Series([not case.refused for case in cases], [case.key for case in cases], dtype=bool)
     return share("all families: no step of a run refuses the unit", taken, "100 %")
 
 
-def family_scores(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
+def family_scores(cases: Sequence[ScoredCase]) -> list[MeasuredFigure]:
     """Return the scores of every family that was run, and the share of the held-out excess that was removed."""
-    found: list[ScoreLine] = []
+    found: list[MeasuredFigure] = []
     for family, name, right, goal in SCORED_FAMILIES:
         family_cases = [c for c in cases if c.family == family]
         if family == "removed":
@@ -195,6 +175,12 @@ def family_scores(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
         family_cases = [c for c in cases if c.family == family]
         name = f"nothing hidden, {family.removeprefix('null_')}: nothing selected"
         found += share(name, _judged(family_cases, lambda case: not case.selected), ">= 99 %")
+    by_hand = [c for c in cases if c.family.startswith("hand_")]
+    seen = [c for c in by_hand if not c.error and not set(c.hidden) <= set(c.not_observable)]
+    found += share("by hand, one effect that the recordings can show: named first", _judged(seen, first_is_right))
+    added = [c for c in cases if c.selected and c.held_out is not None and c.held_out.before is not None]
+    offered = "an effect is offered: it does not raise the held-out error"
+    found += share(offered, _judged(added, harmless), ">= 99 %")
     return found + mean_excess_gone(c for c in cases if c.family in IN_THE_CATALOGUE)
 
 
@@ -206,6 +192,33 @@ def false_selections(cases: Iterable[ScoredCase]) -> list[list[Any]]:
     ``pipeline.estimation.gates``), n, a count for each of ``GATES``, and the exact 95 % interval of the share at the
     gate in force (Clopper and Pearson, Biometrika 26, 1934).
     """
+    rows = []
+    for (*row, kind), gains in sorted(_largest_gains(cases).items(), reverse=True):
+        low, high = _exact(_passing(gains, kind), len(gains))
+        counts = [sum(gain > gate for gain in gains) for gate in GATES]
+        rows.append([*row, kind, len(gains), *counts, f"{100 * low:.3f} to {100 * high:.2f} %"])
+    return rows
+
+
+def false_selection_rates(cases: Iterable[ScoredCase]) -> list[MeasuredFigure]:
+    """Return the share of the units with nothing hidden in which an effect passes the gate, and its exact interval."""
+    found: dict[tuple[str, str], list[float]] = {}
+    for (recorded, _, kind), gains in _largest_gains(cases).items():
+        found.setdefault((recorded, kind), []).extend(gains)
+    return [
+        MeasuredFigure(
+            f"nothing hidden, {recorded}: units in which a {kind} effect passes its gate",
+            _passing(gains, kind) / len(gains),
+            len(gains),
+            "<= 0.1 %",
+            _exact(_passing(gains, kind), len(gains)),
+        )
+        for (recorded, kind), gains in sorted(found.items())
+    ]
+
+
+def _largest_gains(cases: Iterable[ScoredCase]) -> dict[tuple[str, str, str], list[float]]:
+    """Return the largest delta BIC in each unit with nothing hidden, by recordings, noise and kind of effects."""
     largest: dict[tuple[str, str, str], dict[str, float]] = {}
     for case in cases:
         if case.gains is None:
@@ -213,20 +226,24 @@ def false_selections(cases: Iterable[ScoredCase]) -> list[list[Any]]:
         gains = {"slow": [-np.inf], "other": [-np.inf]}
         for name, gain in case.gains.items():
             gains["slow" if effect(name).of_the_room(case.sensor) else "other"].append(gain)
-        recorded, noise = "by hand" if case.rests else "on a table", case.noise in OF_SENSOR_FILE
+        recorded = "by hand" if case.family.startswith("null_hand") else "on a table"
+        noise = "as the sensor file" if case.noise in OF_SENSOR_FILE else "other"
         for kind, of_kind in gains.items():
-            units = largest.setdefault((recorded, "as the sensor file" if noise else "other", kind), {})
+            units = largest.setdefault((recorded, noise, kind), {})
             units[case.key] = max(*of_kind, units.get(case.key, -np.inf))
-    rows = []
-    for (*row, kind), units in sorted(largest.items(), reverse=True):
-        counts = {gate: sum(gain > gate for gain in units.values()) for gate in GATES}
-        count = counts[MIN_DELTA_BIC_OF_SLOW if kind == "slow" else MIN_DELTA_BIC]
-        ends = scipy.stats.binomtest(count, len(units)).proportion_ci(0.95, method="exact")
-        rows.append([*row, kind, len(units), *counts.values(), f"{100 * ends.low:.3f} to {100 * ends.high:.2f} %"])
-    return rows
+    return {row: [*units.values()] for row, units in largest.items()}
 
 
-def mean_excess_gone(cases: Iterable[ScoredCase]) -> list[ScoreLine]:
+def _passing(gains: Iterable[float], kind: str) -> int:
+    return sum(gain > (MIN_DELTA_BIC_OF_SLOW if kind == "slow" else MIN_DELTA_BIC) for gain in gains)
+
+
+def _exact(count: int, total: int) -> tuple[float, float]:
+    ends = scipy.stats.binomtest(count, total).proportion_ci(0.95, method="exact")
+    return float(ends.low), float(ends.high)
+
+
+def mean_excess_gone(cases: Iterable[ScoredCase]) -> list[MeasuredFigure]:
     """Return the mean of ``excess_gone`` over the units that have it; an empty list for fewer than two units."""
     gone = [excess_gone(case) for case in cases if not case.error]
     values = np.array([value for value in gone if value is not None])
@@ -234,7 +251,7 @@ def mean_excess_gone(cases: Iterable[ScoredCase]) -> list[ScoreLine]:
         return []
     mean, half = float(values.mean()), Z * float(values.std(ddof=1) / np.sqrt(len(values)))
     least = f"held-out excess over the noise floor that is gone with what was selected, mean (least {values.min():.0%})"
-    return [ScoreLine(least, mean, len(values), ">= 98 %", (mean - half, mean + half))]
+    return [MeasuredFigure(least, mean, len(values), ">= 98 %", (mean - half, mean + half))]
 
 
 SETS = (
@@ -242,7 +259,10 @@ SETS = (
 )  # fmt: skip  # families whose truth is a set of effects of the catalogue that the recordings can show
 # Family: the share of the detection size, and the goal of the median limit over the truth.
 LIMIT_GOALS = {"limit_30": ("0.3", 4.0), "limit_60": ("0.6", 2.2), "limit_100": ("1", 1.6)}
-EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)  # of stated probabilities
+EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 1.0)  # of stated probabilities
+EDGES_OF_SETS = (0.0, 0.95, 0.96, 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 0.999, 1.0)  # of sets with at least 0.95
+Probability = Literal["effects", "single answers", "answer sets"]
+PROBABILITIES: tuple[Probability, ...] = ("effects", "single answers", "answer sets")
 GOAL, FAMILY_GOAL, SIZE_GOAL = ">= 93.6 %", ">= 90 %", 3.0
 STYLE = (
     "<style>.chart{background:#fff}text{font:12px sans-serif;fill:#57606a}.e{text-anchor:end}.m{text-anchor:middle}"
@@ -276,7 +296,7 @@ def answered(cases: Iterable[ScoredCase]) -> list[ScoredCase]:
     return [c for c in cases if family_of(c) in SETS and (c.error or c.answer_set is not None)]
 
 
-def answer_scores(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
+def answer_scores(cases: Sequence[ScoredCase]) -> list[MeasuredFigure]:
     """Return the scores of answer sets and upper limits: how often they contain the truth, and their sizes."""
     known = answered(cases)
     found = share("truth in the 95 % answer set", _judged(known, in_the_set), GOAL)
@@ -290,12 +310,14 @@ def answer_scores(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
         found += share(f"upper limits at {size} x the detection size: above the truth", pd.Series(each >= 1.0), GOAL)
     sizes = [len(case.answer_set) for case in known if case.answer_set is not None]
     found += (
-        [ScoreLine("answers in a set, mean", float(np.mean(sizes)), len(sizes), f"<= {SIZE_GOAL:g}")] if sizes else []
+        [MeasuredFigure("answers in a set, mean", float(np.mean(sizes)), len(sizes), f"<= {SIZE_GOAL:g}")]
+        if sizes
+        else []
     )
     for size, goal in LIMIT_GOALS.values():
         name = f"upper limit at {size} x the detection size over the truth, median"
         if len(over[size]):
-            found.append(ScoreLine(name, float(np.median(over[size])), len(over[size]), f"<= {goal:g}"))
+            found.append(MeasuredFigure(name, float(np.median(over[size])), len(over[size]), f"<= {goal:g}"))
     return found
 
 
@@ -310,17 +332,39 @@ def ratios(cases: Iterable[ScoredCase], family: str) -> np.ndarray:
     return np.array(over)
 
 
-def reliability(cases: Sequence[ScoredCase]) -> list[ScoreLine]:
-    """Return the share of true effects in each bin of stated probability; the name is the bin's mean probability."""
-    pairs = [
-        (probability, name in true_set(case))
-        for case in answered(cases)
-        if not case.error
-        for name, probability in case.probability.items()
-    ]
-    found = pd.DataFrame(pairs, columns=["stated", "true"]).astype({"stated": float, "true": bool})
-    bins = found.groupby(pd.cut(found["stated"], [*EDGES[:-1], np.inf], right=False), observed=True)
-    return [score for _, each in bins for score in share(repr(float(each["stated"].mean())), each["true"])]
+def stated_and_true(cases: Sequence[ScoredCase], of: Probability) -> list[list[tuple[float, bool]]]:
+    """Return for each case the stated probabilities of effects, of answers or of its answer set, and what is true."""
+    found = []
+    for case in answered(cases):
+        if case.error:
+            continue
+        true, answers = true_set(case), [sorted(answer) for answer in case.answer_set or []]
+        found.append(
+            {
+                "effects": [(stated, name in true) for name, stated in case.probability.items()],
+                "single answers": [(p, each == true) for p, each in zip(case.answer_probability, answers, strict=True)],
+                "answer sets": [(min(1.0, sum(case.answer_probability)), true in answers)],
+            }[of]
+        )
+    return found
+
+
+def reliability(cases: Sequence[ScoredCase], of: Probability = "effects") -> list[MeasuredFigure]:
+    """Return the share that is true in each bin of stated probability, with its 99 % interval clustered by unit.
+
+    The name is the bin's mean stated probability, which the interval should contain.
+    """
+    stated = stated_and_true(cases, of)
+    edges = EDGES_OF_SETS if of == "answer sets" else EDGES
+    rows = []
+    for low, high in zip(edges, [*edges[1:-1], np.inf], strict=False):
+        inside = [[(p, t) for p, t in each if low <= p < high] for each in stated]
+        values = [p for each in inside for p, _ in each]
+        if values:
+            mean = float(np.mean(values))
+            true = [np.array([t for _, t in each]) for each in inside]
+            rows += clustered_share(f"{mean:.4f}", true, f"contains {100.0 * mean:.4g} %")
+    return rows
 
 
 def reliability_diagram(cases: Sequence[ScoredCase]) -> str:
@@ -332,13 +376,14 @@ def reliability_diagram(cases: Sequence[ScoredCase]) -> str:
     low, high = np.array([b.interval for b in bins]).T
     ends = np.array([0.0, 1.0])
     total = sum(b.total for b in bins)
-    figure = Figure("reliability", f"Probabilities of effects against the share of them that is there (n = {total})")
+    title = f"Probabilities of effects against the share of them that is there (n = {total})"
+    figure = Figure("reliability", title)
     points = "; ".join(
         f"said {at:.2g}: {round(b.value * b.total)} of {b.total}" for at, b in zip(said, bins, strict=True)
     )
     panel = Panel(
         [LineMark(ends, ends, 5, "dashed"), Dots(said, true, 2, low, high)], "true share", 300, limits=(0.0, 1.0)
     )
-    drawn = chart(figure, points, [panel], "said probability; bars: 95 % intervals", margin=0.02)
+    drawn = chart(figure, points, [panel], "said probability; bars: 99 % intervals", margin=0.02)
     head, tail = str(drawn.svg).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1).split("</title>", 1)
     return f"{head}</title>{STYLE}{tail}\n"

@@ -17,9 +17,9 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from imu_research.figures import wilson
 from imu_research.study.cases import FAMILIES, draw
 from imu_research.study.run import diagnose_case
-from imu_research.study.scores import wilson
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS
 

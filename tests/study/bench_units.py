@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_research.study.scores import wilson
+from imu_research.figures import wilson
 from pipeline.app.one_unit import unit_of_recordings
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS, NotCalibrated, coverage_factor

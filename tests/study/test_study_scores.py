@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy import stats
 
+from imu_research.figures import MeasuredFigure, clustered_share
 from imu_research.study.page import by_signal, confusions, found_at, instead, of_shapes, page, table_of
 from imu_research.study.result import ScoredCase, cases_of
 from imu_research.study.scores import (
@@ -156,7 +159,7 @@ def test_the_page_has_the_figures_the_code_and_the_cases_that_miss() -> None:
     assert "code being `0123`." in text
     assert "| single-00000 | mpu6050 gyroscope one_way | g_sensitivity | b |" in text
     assert "False selections" not in text
-    null = case(truth(key="null_white-00000", rests=20, noise="white"), said(gains={"warm_up": 11.0}))
+    null = case(truth(key="null_hand_white-00000", rests=20, noise="white"), said(gains={"warm_up": 11.0}))
     found = page([*cases, null], "python -m pipeline study DIR")
     assert "| by hand | as the sensor file | slow | 1 | 1 | 1 | 1 | 0 |" in found
     assert "| mpu6050 | gyroscope | `g_sensitivity` | 0.1 | deg/s/g |" in text
@@ -178,6 +181,48 @@ def test_the_truth_must_be_one_of_the_answers_by_its_own_name() -> None:
     shares = {s.name: (s.value, s.total) for s in answer_scores(cases)}
     assert shares["truth in the 95 % answer set"] == (0.5, 2)
     assert shares["most probable answer: exactly the truth"] == (0.5, 2)
+
+
+def test_probabilities_of_answers_and_of_whole_sets_are_compared_by_unit() -> None:
+    cases = [case(truth(name), said(), answer(("a",), ())) for name in ("a", "a", "b")]
+    (alone,) = reliability(cases, "single answers")
+    assert (alone.value, alone.total, float(alone.name)) == (pytest.approx(2 / 6), 6, 0.45)
+    (whole,) = reliability(cases, "answer sets")
+    assert (whole.value, whole.total, float(whole.name), whole.missed) == (pytest.approx(2 / 3), 3, 0.9, False)
+
+
+def test_by_hand_only_another_effect_counts_against_the_diagnosis() -> None:
+    key, alike = "hand_ferraris-00000", {"look_alikes": {"b": {"a": 0.99}}}
+    told = [said(key=key), said("a", key=key), said("b", key=key, **alike), said("b", key=key, look_alikes={"b": {}})]
+    scores = {s.name: s for s in family_scores([case(truth("a", key=key), each) for each in told])}
+    assert scores["by hand, faces and turns, one effect: no other named"].value == 0.75
+    assert scores["by hand, one effect that the recordings can show: named first"].value == 0.5
+
+
+def test_harm_is_a_held_out_error_that_an_offered_effect_raises() -> None:
+    errors = [{"before": 1.0, "after": after, "floor": 0.1} for after in (0.5, 1.005, 1.2)]
+    cases = [case(truth("a"), said("a", held_out=each)) for each in errors]
+    scores = {s.name: s for s in family_scores(cases)}
+    harm = scores["an effect is offered: it does not raise the held-out error"]
+    assert (harm.value, harm.total, harm.missed) == (pytest.approx(2 / 3), 3, True)
+
+
+def test_a_goal_is_missed_by_the_value_or_by_an_interval_that_does_not_contain_it() -> None:
+    assert MeasuredFigure("", 0.979, 10, ">= 98 %", (0.9, 1.0)).missed
+    assert not MeasuredFigure("", 0.98, 10, ">= 98 %", (0.9, 1.0)).missed
+    assert MeasuredFigure("", 0.002, 10, "<= 0.1 %", (0.0, 1.0)).missed
+    assert MeasuredFigure("", 0.5, 10, "contains 95 %", (0.4, 0.6)).missed
+    assert not MeasuredFigure("", 37.0, 1, "<= 40", unit="ms").missed
+
+
+def test_the_interval_of_a_clustered_share_is_that_of_the_units() -> None:
+    """Units that are all right or all wrong: the interval of a mean of k zeros and ones, by Student's t."""
+    inside = [np.full(5, value) for value in [True] * 30 + [False] * 10]
+    (found,) = clustered_share("", inside)
+    mean, each = 0.75, np.array([1.0] * 30 + [0.0] * 10)
+    half = stats.t.ppf(0.995, 39) * each.std(ddof=1) / np.sqrt(40.0)
+    assert found.interval == (pytest.approx(mean - half), pytest.approx(mean + half))
+    assert (found.value, found.total) == (mean, 200)
 
 
 def test_limits_are_counted_where_the_effect_was_not_selected() -> None:
