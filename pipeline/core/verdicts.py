@@ -40,6 +40,7 @@ def css_class(verdict: str | None) -> str:
 
 WITH_THEM = " (with which U of the "  # between open effects and the uncertainty, in summary.csv and sentences
 MARK_ABOVE_FLOORS = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good
+DOUBTS = {Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUBT, Verdict.LEFT_BY_METHOD}
 FAILED, INCOMPLETE, IMPLAUSIBLE, NOT_HELD_OUT = "failed", "incomplete", "implausible", "not_held_out"
 FAR, BEYOND_ACCEPTANCE, READY = "far_above_noise", "beyond_acceptance", "ready"
 SETTING = re.compile(r"\(([a-z_.]+=\w+)\)")  # a setting within a next step
@@ -69,7 +70,7 @@ KINDS = {  # the most urgent first
         "reference in doubt", "recordings contradict each other", "check table log and mounting, and record again"
     ),
     Verdict.UNEXPLAINED: Kind(
-        "unexplained", "the error exceeds the noise, and no effect of the catalogue explains it",
+        "unexplained", "something exceeds the noise, and no effect of the catalogue explains it",
         "record what the unit's page proposes",
     ),
     Verdict.FLOOR_IN_DOUBT: Kind(
@@ -96,6 +97,29 @@ KINDS = {  # the most urgent first
 }  # fmt: skip
 
 
+FIGURES = {  # what decides a verdict: in the words of pages, index, terminal and ``summary.csv``, and what it is over
+    "held_out": ("held-out error", ""),  # over the noise: see ``Error``
+    "misfit": ("misfit of the fit", "noise"),
+    "scatter": ("scatter of the moves", "noise"),
+    "angle": ("angle after held-out moves", "noise"),
+    "angle_expected": ("angle after held-out moves", "the largest expected"),
+    "dependence": ("dependence of the residual on", ""),
+    "check": ("check of the recordings", ""),
+    "static": ("mean of the static recording", "the largest expected"),
+    "agreement": ("matrix on held-out motion", "U"),
+    "below": ("held-out error", "the least expected"),
+    "method": ("difference from a free fit", ""),
+    "held": ("parameters that the sensor file determines", ""),
+}
+DECIDED = re.compile(r"(?P<figure>.+), (?P<times>\S+) x (?P<of>.+)")
+
+
+def decided_words(figure: str, times: float | None = None, named: str = "") -> str:
+    """Return the figure that decided a verdict in words: ``scatter of the moves, 7.2 x noise``."""
+    words, of = FIGURES[figure]
+    return f"{words} {named}".rstrip() + ("" if times is None or not of else f", {times:.3g} x {of}")
+
+
 class Error(NamedTuple):
     """The held-out rms error of a sensor before and after calibration, and what noise alone gives, in its unit.
 
@@ -117,7 +141,8 @@ class Problem(NamedTuple):
     """What keeps units from being ready: a line of a campaign's page and of the terminal.
 
     ``kind``: of ``KINDS``; ``what``: sensors, with missing effects; ``units``: the worst first; ``ratios``: smallest
-    and largest error over noise floor; ``step``: what to do next; ``effects``: ``sensor.effect`` that are missing.
+    and largest error over noise floor; ``step``: what to do next; ``effects``: ``sensor.effect`` that are missing;
+    ``decided``: the figure that decided a verdict, with its range in the units.
     """
 
     kind: str
@@ -126,6 +151,7 @@ class Problem(NamedTuple):
     ratios: tuple[float, float] | None
     step: str
     effects: tuple[str, ...] = ()
+    decided: str = ""
 
 
 def error_of(held_out: Mapping[str, Any] | None) -> Error:
@@ -200,7 +226,7 @@ def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False
 
     ``once``: each unit by its most urgent problem alone.
     """
-    groups: dict[tuple[str, tuple[str, ...]], list[tuple[float, str, str, list[str]]]] = {}
+    groups: dict[tuple[str, tuple[str, ...]], list[tuple[float, str, str, list[str], str]]] = {}
     for row, errors, kinds in map(state_of, rows):
         for kind, sensors in [*kinds.items()][: 1 if once else None]:
             effects: tuple[str, ...] = ()
@@ -208,18 +234,29 @@ def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False
                 names = [(s, (row.get(f"{s}_selected") or "").split(";")) for s in sensors]
                 effects = tuple(f"{s}.{name}" for s, chosen in names for name in chosen if name)
             ratio, worst = max(((errors[s].ratio or 0.0, s) for s in sensors), default=(0.0, ""))
-            step = row.get(f"{worst}_next_step") or ""
-            groups.setdefault((kind, effects), []).append((ratio, str(row["unit"]), step, sensors))
+            step, decided = (row.get(f"{worst}_{column}") or "" for column in ("next_step", "decided_by"))
+            groups.setdefault((kind, effects), []).append((ratio, str(row["unit"]), step, sensors, decided))
     order, found = [*KINDS], []
     for (kind, effects), entries in sorted(groups.items(), key=lambda group: order.index(group[0][0])):
         entries.sort(key=lambda entry: -entry[0])
         known = [ratio for ratio, *_ in entries if ratio]
-        of = [s for s in SENSORS if any(s in sensors for *_, sensors in entries)]
+        of = [s for s in SENSORS if any(s in entry[3] for entry in entries)]
         what = ", ".join(effects).replace("_", " ").replace(".", ": ") if effects else ", ".join(of)
         step = KINDS[kind].step
         if kind in set(Verdict) - {Verdict.MISSING_EFFECT} and entries[0][2]:
             others = len({entry[2] for entry in entries}) > 1
             step = entries[0][2] + f" ({entries[0][1]}; the pages of the others state theirs)" * others
         units, span = [unit for _, unit, *_ in entries], (known[-1], known[0]) if known else None
-        found.append(Problem(kind, what, units, span, step, effects))
+        decided = _decided([entry[4] for entry in entries]) if kind in DOUBTS else ""
+        found.append(Problem(kind, what, units, span, step, effects, decided))
     return found
+
+
+def _decided(texts: Sequence[str]) -> str:
+    """Return the figure that decided the verdict on the first of some units, with its range in all that it decided."""
+    first = DECIDED.fullmatch(texts[0])
+    if first is None:
+        return texts[0]
+    same = [each for each in map(DECIDED.fullmatch, texts) if each and each.group(1, 3) == first.group(1, 3)]
+    times = sorted((each["times"] for each in same), key=float)
+    return f"{first['figure']}, {' to '.join(dict.fromkeys((times[0], times[-1])))} x {first['of']}"

@@ -98,8 +98,9 @@ class CampaignResults:
         ``<sensor>_error_before``, ``_error_after`` (rms), ``_mean_abs_before``, ``_mean_abs_after``, ``_noise_floor``
         (g or deg/s), ``_verdict``, ``_selected`` (missing effects, joined by ";"), ``_reason``, ``_answers`` (number of
         answers in the answer set), ``_beyond_limits`` (parameters beyond the sensor file's limits), ``_implausible``,
-        ``_not_in_uncertainty``, ``_not_held_out`` (why nothing was held out); ``pass``; ``left_out`` (rows that no
-        fit uses); ``incomplete`` (stages after the fit that failed, and why); and other columns of ``units.csv``.
+        ``_not_in_uncertainty``, ``_not_held_out`` (why nothing was held out), ``_decided_by`` (the figure that
+        decided the verdict); ``pass``; ``left_out`` (rows that no fit uses); ``incomplete`` (stages after the fit that
+        failed, and why); and other columns of ``units.csv``.
         """
         kinds = {name: "float" if name.endswith(FIGURE_ENDINGS) else "str" for name in SUMMARY_COLUMNS} | {
             "pass": "boolean"

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from imu_logs.units import SENSORS
 from pipeline.core.errors import shortened
 from pipeline.core.files import INSTALLED, JSON, read_json, text_of_cell
-from pipeline.core.verdicts import FAILED, KINDS, READY, SETTING, WITH_THEM, Verdict, problems, state_of
+from pipeline.core.verdicts import FAILED, KINDS, READY, SETTING, WITH_THEM, Verdict, decided_words, problems, state_of
 from pipeline.output.history import difference, dropped, errors_of, of_units, read_history
 
 if TYPE_CHECKING:
@@ -187,11 +187,13 @@ def problem_words(problem: Problem, most: int = NAMED_PER_LINE) -> str:
 
 
 def ratio_words(problem: Problem) -> str:
-    """Return the range of error over noise: ``11 to 64 x noise``; empty where it is not known."""
-    if not problem.ratios:
-        return ""
+    """Return what decided a verdict, or the range of error over noise: ``11 to 64 x noise``; empty if not known."""
+    held_out = decided_words("held_out")
+    if problem.decided not in ("", held_out) or not problem.ratios:
+        return problem.decided
     low, high = (f"{ratio:.3g}" for ratio in problem.ratios)
-    return f"{high} x noise" if low == high else f"{low} to {high} x noise"
+    span = high if low == high else f"{low} to {high}"
+    return f"{held_out} {span} x noise" if problem.decided else f"{span} x noise"
 
 
 def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) -> str:

@@ -69,13 +69,13 @@ def test_a_method_that_fits_is_not_compared() -> None:
 
 
 def test_the_given_calibration_is_blamed_where_a_fit_of_the_recordings_leaves_noise_alone() -> None:
-    verdict, reason = decide(GIVEN)
+    verdict, reason, _ = decide(GIVEN)
     assert verdict == "left_by_method"
     assert reason.endswith("the given calibration causes the error.")
     assert decide(replace(GIVEN, method="rests_and_moves"))[0] == "reference_in_doubt"
     assert decide(replace(GIVEN, over_noise=4.0))[0] == "unexplained"
     inside = replace(GIVEN, published=HeldOutError(0.05, 0.01, 0.1))
-    assert decide(inside) == ("nothing_missing", "")
+    assert decide(inside) == ("nothing_missing", "", "")
     assert decide(replace(inside, approximations=("bias",)))[0] == "left_by_method"
 
 

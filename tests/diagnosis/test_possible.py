@@ -97,7 +97,8 @@ def test_noise_far_beyond_the_sensor_file_is_no_cause_but_another_sensor() -> No
 
 def test_moves_that_scatter_far_beyond_the_noise_are_unexplained() -> None:
     e = VerdictInput("gyroscope", Verdict.NOTHING_MISSING, on_table=False, scatter=1.1 * MAX_SCATTER_BY_HAND)
-    verdict, reason = decide(e)
+    verdict, reason, figure = decide(e)
+    assert figure == "scatter of the moves, 6.6 x noise"
     assert verdict == Verdict.UNEXPLAINED
     assert "6.6 times the noise" in reason
     steady = VerdictInput("gyroscope", Verdict.NOTHING_MISSING, on_table=False, scatter=0.9 * MAX_SCATTER_BY_HAND)

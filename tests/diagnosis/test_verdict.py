@@ -113,10 +113,11 @@ def held_out(after: float) -> SelectionErrors:
     ],
 )
 def test_the_first_that_applies_is_said_with_its_numbers(evidence: VerdictInput, verdict: str, words: str) -> None:
-    found, reason = decide(evidence)
+    found, reason, figure = decide(evidence)
     assert found == verdict
     assert words in reason
     assert bool(words) == bool(reason)
+    assert bool(figure) == (found != evidence.found or bool(reason) or found == "missing_effect")
     diagnosis = SensorDiagnosis(
         evidence.found,
         [],

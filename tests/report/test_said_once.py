@@ -10,13 +10,14 @@ import pytest
 from pipeline.app.commands.explain import explain
 from pipeline.core.files import write_json
 from pipeline.core.records import SENSORS
-from pipeline.core.verdicts import error_in_row, error_of, kinds_of, problems
+from pipeline.core.verdicts import decided_words, error_in_row, error_of, kinds_of, problems
 from pipeline.evaluation import diagnosis as diagnosis_package
 from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.output import pages as report_package
 from pipeline.output.history import errors_of, of_units, record, unit_state
-from pipeline.output.outcome import changes_of, counted
+from pipeline.output.outcome import changes_of, counted, problem_words
 from pipeline.output.pages import campaign_page
+from pipeline.output.pages.certificate import model_state
 from pipeline.output.pages.chart import Figure
 from pipeline.output.pages.fleet import runs_data, times_of, with_history
 from pipeline.output.pages.group_charts import Point, bars
@@ -83,6 +84,29 @@ def test_the_error_of_the_runs_is_the_one_of_page_and_index(known: Unit, tmp_pat
     del of_version_before["accelerometer"]["vector_error"]
     kinds = [error.kind for error in errors_of([of_version_before, after], "accelerometer")]
     assert kinds == ["magnitude"] * 2
+
+
+def test_the_figure_that_decided_a_verdict_is_the_one_that_is_said(known: Unit, tmp_path: Path) -> None:
+    found = copy.deepcopy(known.diagnosis)
+    found["gyroscope"] |= {"verdict": "unexplained", "selected": [], "residual_over_noise": 0.79}
+    found["gyroscope"] |= {"decided_by": decided_words("scatter", 7.21), "unexplained": [], "suggested_effect": None}
+    words = {s: in_words(found[s], s) for s in SENSORS}
+    said = "No plausible effect of the catalogue explains the scatter of the moves of the gyroscope, 7.21 x noise."
+    assert words["gyroscope"][0] == said
+    page = Text(render(known.calibration, known.validation, found, [], known.settings, words=words)).text
+    assert said.replace(" x ", " × ") in page
+    row = summary_row("U1", known.calibration, known.validation, found, {}) | {"accelerometer_verdict": ""}
+    assert row["gyroscope_decided_by"] == "scatter of the moves, 7.21 x noise"
+    index = Text(campaign_page.render("bench", [row], [])).text
+    assert "scatter of the moves, 7.21 × noise" in index
+    write_json(tmp_path / "validations" / "U1.json", known.validation)
+    assert said in explain(tmp_path, {"U1": found | {"unit": "U1"}}, {})
+    (problem, *_) = problems([row, row | {"unit": "U2", "gyroscope_decided_by": decided_words("scatter", 9.0)}])
+    assert problem_words(problem).endswith("gyroscope; scatter of the moves, 7.21 to 9 x noise")
+    said_there = model_state(known.validation["gyroscope"], found["gyroscope"])["sentence"]
+    assert "scatter of the moves, 7.21 x noise" in said_there
+    (problem, *_) = problems([row | {"gyroscope_decided_by": decided_words("held_out")}])
+    assert re.search(r"; held-out error \S+ x noise$", problem_words(problem))
 
 
 def test_the_terminal_names_a_unit_once_and_an_action(known: Unit) -> None:

@@ -190,7 +190,7 @@ def summary_rows(folder: Path, diagnoses: Mapping[str, JSON], failures: Mapping[
         for sensor in [s for s in SENSORS if document.get(s)]:
             part = document[sensor]
             row |= {f"{sensor}_verdict": part["verdict"], f"{sensor}_selected": ";".join(part["selected"])}
-            row |= {f"{sensor}_next_step": part["next_experiment"]}
+            row |= {f"{sensor}_next_step": part["next_experiment"], f"{sensor}_decided_by": part.get("decided_by")}
             row |= {"incomplete": f"diagnose/{sensor}: it failed"} if part.get("failed") else {}
         rows_.append(row)
     return [*rows_, *({"unit": unit, "status": "failed"} for unit in failures)]

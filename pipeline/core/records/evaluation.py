@@ -382,6 +382,7 @@ class SensorDiagnosis:
     details: Mapping[str, Any] = field(default_factory=dict)  # entries of the document: pictures, cross-validation
     given: bool = False  # whether the calibration is given, not fitted
     reason: str = ""
+    decided_by: str = ""  # the figure that decided the verdict, in words (``pipeline.core.verdicts.FIGURES``)
     further: Mapping[str, Any] = field(default_factory=dict)  # influence, goodness of fit, effective noise
 
     @property
@@ -417,5 +418,6 @@ class SensorDiagnosis:
             **self.details,
             **({"given": True} if self.given else {}),
             "reason": self.reason,
+            **({"decided_by": self.decided_by} if self.decided_by else {}),
             **self.further,
         }

@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from pipeline.core.verdicts import Verdict
+from pipeline.core.verdicts import Verdict, decided_words
 from pipeline.estimation.stages import FitStage
-from pipeline.evaluation.diagnosis.words import of_unknown, template
+from pipeline.evaluation.diagnosis.words import listed, of_unknown, plain, template
 from pipeline.physics.effects.base import unit_of
 
 if TYPE_CHECKING:
@@ -253,17 +253,50 @@ RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
 )
 
 
-def decide(e: VerdictInput) -> tuple[Verdict, str]:
-    """Return the verdict and its reason in one or two sentences; without a reason if the selection decides."""
+def _of_residual(e: VerdictInput) -> str:
+    """Return the figure by which a residual is unexplained."""
+    if e.unknown and e.at_noise is not False:
+        return decided_words("dependence", named=listed([plain(name) for name in e.unknown]))
+    return decided_words("misfit", e.left)
+
+
+def _over(error: HeldOutError | None, limit: str) -> float | None:
+    return error.error / getattr(error, limit) if error and getattr(error, limit) > 0.0 else None
+
+
+FIGURE_OF: dict[str, Callable[[VerdictInput], str]] = {  # by the reason; of all others it is the held-out error
+    "doubts": lambda _: decided_words("check"),
+    "missing": lambda e: decided_words("misfit", e.over_noise),
+    "static": lambda e: decided_words("static", _over(e.static, "high")),
+    "unexplained": _of_residual,
+    "moves": lambda e: decided_words("angle_expected", e.moves.rms_deg / e.moves.largest_deg if e.moves else None),
+    "far_moves": lambda e: decided_words("angle", e.moves.over_noise if e.moves else None),
+    "scatter": lambda e: decided_words("scatter", e.scatter),
+    "disagreement": lambda e: decided_words(
+        "agreement", abs(e.agreement.error) / e.agreement.expanded_uncertainty if e.agreement else None
+    ),
+    "below": lambda e: decided_words("below", _over(e.published, "low")),
+    "too_quiet": lambda e: decided_words("misfit", e.over_noise),
+    "approximations": lambda _: decided_words("method"),
+    "held": lambda _: decided_words("held"),
+}
+
+
+def decide(e: VerdictInput) -> tuple[Verdict, str, str]:
+    """Return the verdict, its reason in one or two sentences, and the figure that decided it.
+
+    Both texts are empty if the selection decides.
+    """
     for verdict, reason, applies in RULES:
         if applies(e):
-            return verdict, " ".join(getattr(template("reasons.txt").module, reason)(e).split())
-    return e.found, ""
+            figure = FIGURE_OF[reason](e) if reason in FIGURE_OF else decided_words("held_out")
+            return verdict, " ".join(getattr(template("reasons.txt").module, reason)(e).split()), figure
+    return e.found, "", ""
 
 
 def judged(diagnosis: SensorDiagnosis, e: VerdictInput) -> SensorDiagnosis:
     """Return the diagnosis of a selection with the verdict by the evidence, its reason and the next experiment."""
-    verdict, reason = decide(e)
+    verdict, reason, figure = decide(e)
     step = _next_step(verdict, diagnosis, e)
     if e.given and verdict == Verdict.MISSING_EFFECT:
         effects = ", ".join(diagnosis.selected)
@@ -272,6 +305,7 @@ def judged(diagnosis: SensorDiagnosis, e: VerdictInput) -> SensorDiagnosis:
         diagnosis,
         verdict=verdict,
         reason=reason,
+        decided_by=figure,
         given=e.given,
         next_experiment=step or diagnosis.next_experiment,
         override=diagnosis.override if _offered(verdict, diagnosis, e) else "",

@@ -19,7 +19,7 @@ from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.outcome import all_well, beyond_limits_groups, command_of, counts_of, explain_command, ratio_words
 from pipeline.output.pages.chart import Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
 from pipeline.output.pages.fleet import parameter_table, wide
-from pipeline.output.pages.pages import Scale, number, percent, scale_of, script_data, template, unit_text
+from pipeline.output.pages.pages import Scale, number, percent, scale_of, script_data, template, typeset, unit_text
 from pipeline.output.pages.parameters import SUMMARY_COLUMNS
 
 if TYPE_CHECKING:
@@ -114,8 +114,8 @@ def render(
         devices=len(devices),
         counts=counts_of(states),
         kinds=KINDS,
-        well=all_well(states).replace(" x noise", " × noise"),
-        problems=[(p, ratio_words(p).replace(" x ", " × "), command_of(p, settings)) for p in found],
+        well=typeset(all_well(states)),
+        problems=[(p, typeset(ratio_words(p)), command_of(p, settings)) for p in found],
         most_problems=MOST_PROBLEMS,
         all_command=explain_command(settings, ["--all"]),
         limited=beyond_limits_groups(rows),

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup
 
 from pipeline.core.records import AXES, SENSORS
-from pipeline.core.verdicts import KINDS, Verdict, error_of
+from pipeline.core.verdicts import DOUBTS, KINDS, Verdict, error_of
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.outcome import run_command
 from pipeline.output.pages.held_out_section import first_and_last_step
@@ -213,7 +213,8 @@ def model_state(held_out: JSON | None, found: JSON | None) -> JSON:
     if verdict == Verdict.NOTHING_MISSING:
         said = "complete as far as the recordings show"
     ratio = f"error of the {error.kind} {number(error.ratio)} × noise" if error.ratio else ""
-    sentence = "; ".join(filter(None, [said or "not diagnosed", ratio]))
+    decided = (found or {}).get("decided_by") if verdict in DOUBTS else ""
+    sentence = "; ".join(filter(None, [said or "not diagnosed", decided, ratio]))
     return {
         "verdict": verdict,
         "notModelled": missing,

@@ -35,6 +35,8 @@ PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"))
 MINUS = "\N{MINUS SIGN}"
 TYPOGRAPHIC = {
     "+-": "±",
+    " x noise": " × noise",
+    " x the l": " × the l",  # largest, least expected: ``pipeline.core.verdicts.FIGURES``
     "delta BIC": "ΔBIC",
     "degC": "°C",
     "^2": "²",

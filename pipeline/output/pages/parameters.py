@@ -51,11 +51,12 @@ SENSOR_COLUMNS = (
 REMARK_KINDS = ("beyond_limits", "implausible", "not_in_uncertainty", "not_held_out")
 OF_CALIBRATION = tuple(f"{s}_{c}" for c in REMARK_KINDS for s in SENSORS)
 OF_UNIT = ("left_out", "incomplete")  # ``incomplete``: written by ``gather``, which knows what no stage could make
-# the error of the vector, where the attitude is known, and the next step where the verdict is not ``nothing_missing``
+# the error of the vector, where the attitude is known, the next step where the verdict is not ``nothing_missing``, and
+# the figure that decided the verdict
 NEXT = tuple(
     f"{s}_{c}"
     for s in SENSORS
-    for c in ("vector_error_before", "vector_error_after", "vector_noise_floor", "next_step")
+    for c in ("vector_error_before", "vector_error_after", "vector_noise_floor", "next_step", "decided_by")
 )
 SUMMARY_COLUMNS = (
     *UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, *OF_UNIT, *NEXT
@@ -221,7 +222,7 @@ def summary_row(
         figures = vector[1:] if vector.kind == "vector" else (None,) * 3
         step = found.get("next_experiment") if found.get("verdict") != Verdict.NOTHING_MISSING else None
         of_sensor = [name for name in NEXT if name.startswith(sensor)]
-        row |= dict(zip(of_sensor, (*figures, step or None), strict=True))
+        row |= dict(zip(of_sensor, (*figures, step or None, found.get("decided_by") or None), strict=True))
         row[f"{sensor}_not_in_uncertainty"] = "; ".join(source for source, _ in beyond_uncertainty(part)) or None
     for key, value in units_table_row.items():
         if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:
