@@ -20,6 +20,7 @@ import imu_calibration.unit
 import numpy as np
 import pandas as pd
 import pytest
+from calls import ONCE_A_RECORDING, ONCE_A_RECORDING_AND_SENSOR, counted, designs
 from hydra import initialize
 from hydra.core.global_hydra import GlobalHydra
 from imu_calibration.physics.effects import catalogue as same_catalogue
@@ -135,6 +136,45 @@ def test_a_folder_a_campaign_and_data_frames_give_the_same_figures(
         part, result = of_campaign.calibration[sensor], getattr(of_campaign, sensor)
         assert result.matrix.tolist() == part["matrix"]
         assert result.expanded_uncertainty["bias"].tolist() == part["expanded_uncertainty"]["bias"]
+
+
+AUTO = ["effects.accelerometer=auto", "effects.gyroscope=auto"]
+KNOWN = [f"sensor.{s}.known_temperature.bias=[2e-5, -1e-5, 1e-5]" for s in ("accelerometer", "gyroscope")]
+
+
+@pytest.mark.parametrize(
+    ("method", "overrides"),
+    [
+        (None, AUTO),
+        (None, ["effects.accelerometer=[mounting]", "effects.gyroscope=[mounting]"]),
+        (None, [*AUTO, "table.seat_deg=2"]),
+        ("known_temperature", [*AUTO, *KNOWN]),
+        ("staged", AUTO),
+    ],
+)
+def test_motion_rests_temperatures_and_designs_are_computed_once(method: str | None, overrides: list[str]) -> None:
+    folder = Path(__file__).parents[1] / "data/demo/raw/mpu6050-2-hidden"
+    with counted((*ONCE_A_RECORDING, *ONCE_A_RECORDING_AND_SENSOR)) as calls, designs() as built:
+        pipeline.calibrate(folder, **BENCH, method=method, overrides=overrides)
+    most: dict[str, int] = {}
+    for (path, _), count in calls.items():
+        name = path.rpartition(".")[2]
+        most[name] = max(most.get(name, 0), count)
+    # a table's rests as read and in body axes; the rows of each sensor
+    assert most.pop("rests_from_table") == most.pop("_part") == 2
+    assert set(most.values()) == set(built.values()) == {1}
+    assert {sensor for sensor, *_ in built} == {"accelerometer", "gyroscope"}
+
+
+def test_what_a_unit_by_hand_needs_is_computed_once(tmp_path: Path) -> None:
+    options = (
+        "--sensor mpu6050 --procedure multi_position --table hand --positions 24 --static 0 --validation 0 --quiet"
+    )
+    assert simulate.main([str(tmp_path / "hand"), *options.split()]) == 0
+    with counted(ONCE_A_RECORDING) as calls:
+        pipeline.calibrate_unit(tmp_path / "hand", "U001", overrides=AUTO)
+    assert {name for name, _ in calls} >= {"find_rests", "smooth_temperature"}
+    assert set(calls.values()) == {1}
 
 
 def test_files_may_be_named_one_by_one_and_one_sensor_needs_only_its_own(folder: Path) -> None:

@@ -58,7 +58,7 @@ from pipeline.physics.effects.base import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Hashable, Sequence
 
     from pipeline.core.records import Index, Motion, Noise, Values
     from pipeline.estimation.observations import Observations, RecordingRows
@@ -90,6 +90,12 @@ class EffectColumns:
     values: Values  # (p,); at which its derivatives are taken
     full: bool = False  # whether the nonlinear parameters have columns, too
     prior: NormalPrior | None = None  # of the parameters; None: flat
+
+    @property
+    def key(self) -> tuple[Hashable, ...]:
+        """What the columns and the prior follow from, for the observations of one unit."""
+        prior = self.prior and (self.prior.mean.tobytes(), self.prior.precision.tobytes())
+        return self.effect.name, self.values.tobytes(), self.full, prior
 
     def layout(self) -> Layout:
         """Return the layout of the effect's columns."""
@@ -183,6 +189,11 @@ class Start:
     K: Values  # (3, 3)
     scale: Values  # (3,); white noise of each axis, for the weights between the axes
     terms: tuple[EffectColumns, ...] = ()  # the effects at their values
+
+    @property
+    def key(self) -> tuple[Hashable, ...]:
+        """What a fit from here follows from."""
+        return self.bias.tobytes(), self.K.tobytes(), self.scale.tobytes(), *(term.key for term in self.terms)
 
 
 def ordinary_base(observations: Observations, noise: Noise | None) -> Start:

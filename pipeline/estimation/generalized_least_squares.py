@@ -103,6 +103,18 @@ class JointFit(Start):
     rank: int  # parameters, or combinations of them, that the readings determine
 
     @cached_property
+    def in_mean_frame(self) -> tuple[JointFit, Values]:
+        """The fit in the frame of the mean mounting, and the map of its errors to that frame."""
+        found = next((each for each in placed(self.terms).values() if isinstance(each[0].effect, Mounting)), None)
+        if found is None:
+            return self, np.eye(len(self.covariance))
+        mounting, place = found
+        K, theta = in_mean_frame(self.K, mounting.values)
+        change = errors_in_mean_frame(K, theta, place, len(self.covariance))
+        terms = tuple(replace(term, values=theta) if term is mounting else term for term in self.terms)
+        return replace(self, K=K, terms=terms, covariance=change @ self.covariance @ change.T), change
+
+    @cached_property
     def _designs(self) -> dict[Observations, Design]:
         """The results of ``design``."""
         return {}
@@ -282,7 +294,16 @@ def fit_best(
     Effects of timing are first fitted with the base alone: far from their values a linear step is inaccurate, and other
     effects would absorb their signal.
     """
+    key = fit_best, start.key, tuple(tuple(term.key for term in terms) for terms in combinations), tuple(settings)
+    return observations.once(key, lambda: _fit_best(observations, combinations, start, settings))
 
+
+def _fit_best(
+    observations: Observations,
+    combinations: Sequence[Sequence[EffectColumns]],
+    start: Start,
+    settings: Sequence[Setting],
+) -> JointFit:
     def likelihood(terms: Sequence[EffectColumns]) -> float:
         design = design_at(observations, _with_all_columns(start, terms))
         return _solve(design, observations, settings).log_likelihood
@@ -362,7 +383,7 @@ def calibration_of(
     With ``settings``, the uncertainties include the accuracies of the table, except those that an effect of the fit
     estimates.
     """
-    (fit, turned), sensor = fit_in_mean_frame(fit), observations.sensor
+    (fit, turned), sensor = fit.in_mean_frame, observations.sensor
     matrix = np.asarray(np.linalg.solve(fit.K, np.eye(3)), np.float64)
     change = np.eye(len(fit.covariance))
     change[MATRIX, MATRIX] = -np.kron(matrix, matrix.T)
@@ -419,15 +440,3 @@ def calibration_of(
         part, freedom = change @ prior_part @ change.T, np.full(len(change), np.inf)
         lines.append(Contribution(name.replace("_", " "), "B", NORMAL, part, freedom, remark=remark))
     return budgeted(found, reference, whole, errors, lines, settings, results, names)
-
-
-def fit_in_mean_frame(fit: JointFit) -> tuple[JointFit, Values]:
-    """Return a fit in the frame of the mean mounting, and the map of its errors to that frame."""
-    found = next((each for each in placed(fit.terms).values() if isinstance(each[0].effect, Mounting)), None)
-    if found is None:
-        return fit, np.eye(len(fit.covariance))
-    mounting, place = found
-    K, theta = in_mean_frame(fit.K, mounting.values)
-    change = errors_in_mean_frame(K, theta, place, len(fit.covariance))
-    terms = tuple(replace(term, values=theta) if term is mounting else term for term in fit.terms)
-    return replace(fit, K=K, terms=terms, covariance=change @ fit.covariance @ change.T), change

@@ -18,11 +18,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from pipeline.core.records import once, once_of_log
+from pipeline.core.records import Same, once_of_log
 from pipeline.estimation.gauss_markov import Blocks, constant_bias_s, information
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.estimation.turns import RowGroups, reference_valid, rows_of
@@ -33,11 +33,13 @@ from pipeline.physics.signal.encoder_rate import rate_by_angle
 from pipeline.physics.signal.filters import filtered, impulse_response
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 
     from pipeline.core.records import Mask, Motion, Noise, Recording, Values
     from pipeline.core.settings import Table
 
+
+Result = TypeVar("Result")
 
 ROLES = ("accelerometer", "gyroscope", "static")
 BIAS_BLOCKS = 300  # of the bias: their length is below a tenth of the shortest correlation time of the grid
@@ -52,7 +54,7 @@ HIDDEN_ANGLE = 0.1
 UNUSED_ROW_WEIGHT = 1e-9  # factor on the weight of rows that are not used: not 0, so that no block is empty
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RecordingRows:
     """The rows of one recording."""
 
@@ -65,7 +67,8 @@ class RecordingRows:
     interval: float  # s; between the recording's samples
     rounding: Values | None = None  # (m,); variance of the rate by a coarse encoder, (deg/s)^2; None: a fine one
     # motion by names and values of effects of timing
-    moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, compare=False, repr=False)
+    moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, repr=False)
+    observations: dict[Hashable, Observations] = field(default_factory=dict, repr=False)  # that begin with these rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +84,17 @@ class Observations:
     levelling_deg: float = 0.0  # standard uncertainty of the table's level; 0: not stated
     white: float = 0.0  # standard deviation of a sample's white noise, mean of the axes; 0: not known
     steady: float = float("inf")  # s; time over which the bias is constant against white noise
+
+    @cached_property
+    def _results(self) -> dict[Hashable, Any]:
+        return {}
+
+    def once(self, key: Hashable, compute: Callable[[], Result]) -> Result:
+        """Return a result that steps and methods of a unit share; ``key``: all that it depends on beside these data."""
+        if key not in self._results:
+            self._results[key] = compute()
+        found: Result = self._results[key]
+        return found
 
     @cached_property
     def reading(self) -> Values:
@@ -175,6 +189,11 @@ def weighted(observations: Observations, noise: Noise | None) -> Observations:
 
     Errors of the angle are not modelled if they are small against the noise.
     """
+    key = noise and (noise.source, noise.correlation_time, noise.length, noise.white.tobytes(), noise.wander.tobytes())
+    return observations.once((weighted, key), lambda: _weighted(observations, noise))
+
+
+def _weighted(observations: Observations, noise: Noise | None) -> Observations:
     parts, white = [], 0.0 if noise is None else float(np.mean(noise.white))
     for part in observations.parts:
         share = information(noise, part.interval)
@@ -210,26 +229,34 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Table) -> Obser
     """
     used = [r for r in recordings if r.role in ROLES and r.samples >= 6]
     logged = [(r, table_motion(r, table)) for r in used if r.reading(sensor) is not None]
-    parts = [part for r, motion in logged if motion is not None and (part := _part(r, sensor, motion)) is not None]
+    parts = [part for r, motion in logged if motion is not None and (part := _rows(r, sensor, motion)) is not None]
 
     def in_time(part: RecordingRows) -> tuple[bool, str, float]:
         """Order recordings in time, within the unit or else within their setup."""
         setup = "" if part.clock_shared else part.motion.setup
         return not part.clock_shared, setup, float(part.motion.time[0]) if part.clock_shared or setup else 0.0
 
-    return Observations(
+    doubt = any(note.code == "N-SEATS" for recording in recordings for note in recording.notes)
+    found = Observations(
         sensor,
         tuple(sorted(parts, key=in_time)),
         earth=earth_of(table) is not None,
         bench=stated_priors(table),
-        mounting_in_doubt=any(note.code == "N-SEATS" for recording in recordings for note in recording.notes),
+        mounting_in_doubt=doubt,
         angle_deg=table.angle_accuracy_deg if table.motion == "logged" else 0.0,
         levelling_deg=table.levelling_deg or 0.0,
     )
+    return found.parts[0].observations.setdefault((found.parts, table, doubt), found) if parts else found
 
 
-@once
-def _part(recording: Recording, sensor: str, motion: Motion) -> RecordingRows | None:
+def _rows(recording: Recording, sensor: str, motion: Motion) -> RecordingRows | None:
+    """Return the rows of one sensor, computed once where the readings of the other are corrected."""
+    arrays = Same(recording.reading(sensor)), Same(recording.flags), Same(recording.filter)
+    return _part(recording, sensor, motion, *arrays)
+
+
+@once_of_log
+def _part(recording: Recording, sensor: str, motion: Motion, *_: Same) -> RecordingRows | None:
     reading = recording.reading(sensor)
     assert reading is not None  # noqa: S101
     filtered = recording.filter["name"] != "none"

@@ -72,16 +72,22 @@ def select(
 
     def searched(observations: Observations) -> Selection:
         """Select effects by all rows of the observations."""
-        start = ordinary_base(observations, noise)
-        base = fit_best(observations, starts_of(configured, observations, known, accelerometer), start, grid)
-        candidates = {}
+        starts, candidates = starts_of(configured, observations, known, accelerometer), {}
         for this in candidates_for(observations, configured):
             prior = prior_of(this, observations, accelerometer, configured)
             candidates[this.name] = EffectColumns(
                 this, np.zeros(len(this.parameters(observations.sensor))), prior=prior
             )
+        models = [[*candidates.values()], *starts]
+        key = select, tuple(tuple(term.key for term in terms) for terms in models), data_sheet.model_dump_json(), search
+        return observations.once(key, lambda: selected(observations, starts, candidates))
+
+    def selected(
+        observations: Observations, starts: list[list[EffectColumns]], candidates: dict[str, EffectColumns]
+    ) -> Selection:
+        start, limits = ordinary_base(observations, noise), limits_of(observations.sensor, data_sheet)
+        base = fit_best(observations, starts, start, grid)
         ranking = Ranking(observations, base, base, candidates, grid)
-        limits = limits_of(observations.sensor, data_sheet)
         selection = Selection(
             observations, noise, data_sheet, start, grid, limits, candidates, base, base, ranking, ranking
         )

@@ -57,6 +57,7 @@ from pipeline.core.records import (
     UnitRecordings,
     Values,
     motion_at_rest,
+    once_of_log,
 )
 from pipeline.estimation.uncertainty_budget import with_uncertainty
 from pipeline.physics.effects.base import with_truth
@@ -108,8 +109,14 @@ def subtracted(
         motion = replace(motion_at_rest(recording.time), temperature=temperature_of(recording))
         truth = compensate(calibration, reading, motion, known)
         corrected = part.take_off(reading, with_truth(motion, sensor, truth))
-        found.append(recording.with_readings(**{sensor: corrected}))
+        found.append(recording.with_readings(**{sensor: _readings(recording, corrected.tobytes())}))
     return found
+
+
+@once_of_log
+def _readings(recording: Recording, values: bytes) -> Values:
+    """Return corrected readings; equal ones are one object, so that what follows from them is computed once."""
+    return np.frombuffer(values).reshape(recording.samples, 3)
 
 
 def with_known(

@@ -142,6 +142,21 @@ class Recording:
         return replace(self, **{n: v[index] for n in OF_SAMPLES if (v := getattr(self, n)) is not None})
 
 
+@dataclass(frozen=True, eq=False)
+class Same:
+    """A value as an argument of a quantity that is computed ``once``: two are equal if the values are one object."""
+
+    value: object
+
+    def __hash__(self) -> int:
+        """Return the hash of the object's identity."""
+        return id(self.value)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the other value is the same object."""
+        return isinstance(other, Same) and self.value is other.value
+
+
 def once(
     compute: Callable[Concatenate[Recording, Arguments], ReturnedQuantity],
 ) -> Callable[Concatenate[Recording, Arguments], ReturnedQuantity]:

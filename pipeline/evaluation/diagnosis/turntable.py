@@ -29,13 +29,7 @@ from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Design, EffectColumns, free_curves, placed
 from pipeline.estimation.gates import min_delta_bic
 from pipeline.estimation.gauss_markov import GaussMarkov
-from pipeline.estimation.generalized_least_squares import (
-    JointFit,
-    calibration_of,
-    design_at,
-    fit_in_mean_frame,
-    fit_terms,
-)
+from pipeline.estimation.generalized_least_squares import JointFit, calibration_of, design_at, fit_terms
 from pipeline.estimation.observations import observe, without_each_recording
 from pipeline.estimation.posterior import posterior
 from pipeline.estimation.ranking import projection, without
@@ -255,7 +249,7 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
         largest = max((explained[j] for j in reported.first.indices(name)), default=0.0)
         return float(largest) / reported.first.samples * white_square
 
-    final, _ = fit_in_mean_frame(reported.fit)
+    final, _ = reported.fit.in_mean_frame
 
     def advice(verdict: Verdict) -> str:
         if verdict == Verdict.UNEXPLAINED:
