@@ -101,7 +101,7 @@ __all__ = [
     "Parameters", "RankedFormula", "Recording", "Reduced", "Same", "SelectionErrors", "SensorCalibration",
     "SensorDiagnosis", "SensorValidation", "StageResult", "StepErrors", "Subtract", "TableEvidence", "TemperatureBin",
     "TwoSided", "UnitRecordings", "Validation", "Values", "Wander", "WanderLikelihood", "base_units", "base_values",
-    "calibrated", "conjugate_product", "continuous", "corrected", "coverage_factor", "files_of_readings", "finite", "fit_from_json",
-    "level_in_body", "matrix_of", "median", "motion_at_rest", "noise_of_steps", "once", "once_of_log",
+    "calibrated", "conjugate_product", "continuous", "corrected", "coverage_factor", "files_of_readings", "finite",
+    "fit_from_json", "level_in_body", "matrix_of", "median", "motion_at_rest", "noise_of_steps", "once", "once_of_log",
     "rate_of_attitude", "standard_uncertainty",
 ]  # fmt: skip
