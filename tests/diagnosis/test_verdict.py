@@ -68,6 +68,8 @@ def held_out(after: float) -> SelectionErrors:
         ),
         (replace(BY_HAND, moves=MovesError(2.9, 3.5)), "nothing_missing", ""),
         (replace(BY_HAND, moves=MovesError(2.9, 3.5, 4.9)), "nothing_missing", ""),
+        (replace(BY_HAND, moves=MovesError(2.9, 0.5, 1.0, 0.9)), "nothing_missing", ""),
+        (replace(BY_HAND, moves=MovesError(2.9, 3.5, 1.0, 1.2)), "unexplained", "1.2 times the most that noise"),
         (
             replace(BY_HAND, moves=MovesError(2.9, 3.5, 5.1)),
             "unexplained",

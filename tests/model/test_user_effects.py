@@ -288,6 +288,33 @@ def test_a_calibration_alone_takes_off_a_formula_of_the_sensor(tmp_path: Path) -
     np.testing.assert_allclose(applied.accelerometer, force, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("formula", "sensor", "what"),
+    [
+        ("u ** 0", "gyroscope", "a constant, which is the bias"),
+        ("cos(0 * time)", "accelerometer", "a constant, which is the bias"),
+        ("3 * u + 2", "accelerometer", "a combination of bias and matrix"),
+        ("fx", "accelerometer", "a combination of bias and matrix"),
+        (["fy", "-fx", "0"], "accelerometer", "a combination of bias and matrix"),
+        ("fx", "gyroscope", ""),  # it depends on the specific force
+        ("abs(u)", "accelerometer", ""),
+        ("maximum(u, 5)", "accelerometer", ""),
+        ("band(temperature, 70, 71)", "accelerometer", ""),
+        ("step(temperature - 25)", "gyroscope", ""),
+    ],
+)
+def test_a_formula_that_is_bias_or_matrix_is_refused_where_it_is_loaded(
+    formula: str | list[str], sensor: str, what: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(yaml.safe_dump(own("mine", sensor, {"c": formula}), sort_keys=False))
+    if not what:
+        assert read_effect_file(file).name == "mine"
+        return
+    with pytest.raises(ConfigurationError, match=rf"mine\.yaml:\d+.*the {sensor} the formula is {what}"):
+        read_effect_file(file)
+
+
 def test_two_calibrations_keep_their_own_formulas_of_one_name() -> None:
     register(effect_from(own("loose_part", "accelerometer", {"d": "fx"}), "another.yaml"))
     kinds = [effect_of(calibration(own("loose_part", "accelerometer", {"d": t})).effects[0]) for t in ("fy", "fz")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,6 +39,32 @@ def test_held_out_moves_beyond_noise_and_uncertainty_are_unexplained() -> None:
         verdicts[name] = said["verdict"]
     assert verdicts == {"good": "nothing_missing", "wrong": "unexplained"}
     assert "misses the direction of gravity" in said["reason"]
+
+
+def few(seed: int, moves: int, wrong: float) -> dict[str, Any]:
+    """Return the judged errors after a few held-out moves, whose rates are wrong by a share, and the verdict."""
+    drawn = draw(Hand(rests=16 + moves), seed)
+    edges = np.flatnonzero(np.diff(drawn.still.astype(int))) + 1
+    ends = edges[::2][14], edges[1::2][14] + 1  # the last rest of the fit, and the first of the held-out recording
+    whole, names = drawn.recording, ("recording", "validation")
+    parts = [
+        replace(whole.select(s), name=n) for n, s in zip(names, (slice(ends[0] - 1), slice(ends[1], None)), strict=True)
+    ]
+    assert parts[1].gyroscope is not None
+    turning = np.linalg.norm(parts[1].gyroscope - drawn.bias["gyroscope"], axis=1, keepdims=True) > 20.0
+    rates = np.where(turning, 1.0 + wrong, 1.0) * parts[1].gyroscope
+    parts[1] = replace(parts[1], role="validation", gyroscope=rates)
+    layers = ["table=hand", "procedure=multi_position", "sensor=mpu6050", "method=rests_and_moves"]
+    unit = unit_of_recordings(parts, layers).run_to("calibration")
+    return unit.validation["gravity_direction"] | {"verdict": unit.diagnosis["gyroscope"]["verdict"]}
+
+
+@pytest.mark.parametrize(("seed", "moves"), [(11, 1), (12, 3), (13, 5)])
+def test_few_held_out_moves_are_judged_by_their_covariance(seed: int, moves: int) -> None:
+    good, wrong = few(seed, moves, 0.0), few(seed, moves, 0.02)
+    assert [found["moves"] for found in (good, wrong)] == [moves, moves]
+    assert good["over_expected"] < 1.0 < wrong["over_expected"]
+    assert (good["verdict"], wrong["verdict"]) == ("nothing_missing", "unexplained")
 
 
 @pytest.mark.parametrize(("rest_s", "code"), [(4.0, "N-SETTLING"), (2.0, "N-REFERENCE")])

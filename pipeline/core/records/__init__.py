@@ -49,6 +49,7 @@ from pipeline.core.records.calibration import (
     fit_from_json,
 )
 from pipeline.core.records.evaluation import (
+    FEWEST_MOVES,
     Agreement,
     Answer,
     Candidate,
@@ -92,16 +93,16 @@ from pipeline.core.records.recording import (
 )
 
 __all__ = [
-    "AFTER_BASE", "AXES", "BASE", "BASE_COUNT", "BASE_NAMES", "BETWEEN_ATTITUDES_S", "BIAS", "BIAS_NAMES", "LIMIT",
-    "MATRIX", "MATRIX_NAMES", "MATRIX_ROWS", "MEDIAN_SIZE", "MONTE_CARLO", "NOISE_OF_ROWS", "NORMAL",
-    "READABLE_VERSIONS", "RECTANGULAR", "SCHEMA_VERSION", "SENSORS", "SENSOR_UNITS", "TURN_AXES", "Agreement", "Answer",
-    "Budget", "BudgetLine", "Candidate", "Contribution", "CorrectionStep", "Dependence", "Estimate", "Fit",
-    "FittedEffect", "FittedForm", "Index", "Integers", "LimitCheck", "Mask", "MethodError", "MonteCarlo", "Motion",
-    "MovesError", "Multiply", "NoMonteCarlo", "Noise", "NotCalibrated", "NotIncluded", "Note", "OverTemperature",
-    "Parameters", "RankedFormula", "Recording", "Reduced", "Same", "SelectionErrors", "SensorCalibration",
-    "SensorDiagnosis", "SensorValidation", "StageResult", "StepErrors", "Subtract", "TableEvidence", "TemperatureBin",
-    "TwoSided", "UnitRecordings", "Validation", "Values", "Wander", "WanderLikelihood", "base_units", "base_values",
-    "calibrated", "conjugate_product", "continuous", "corrected", "coverage_factor", "files_of_readings", "finite",
-    "fit_from_json", "level_in_body", "matrix_of", "median", "motion_at_rest", "noise_of_steps", "once", "once_of_log",
-    "rate_of_attitude", "standard_uncertainty",
+    "AFTER_BASE", "AXES", "BASE", "BASE_COUNT", "BASE_NAMES", "BETWEEN_ATTITUDES_S", "BIAS", "BIAS_NAMES",
+    "FEWEST_MOVES", "LIMIT", "MATRIX", "MATRIX_NAMES", "MATRIX_ROWS", "MEDIAN_SIZE", "MONTE_CARLO", "NOISE_OF_ROWS",
+    "NORMAL", "READABLE_VERSIONS", "RECTANGULAR", "SCHEMA_VERSION", "SENSORS", "SENSOR_UNITS", "TURN_AXES",
+    "Agreement", "Answer", "Budget", "BudgetLine", "Candidate", "Contribution", "CorrectionStep", "Dependence",
+    "Estimate", "Fit", "FittedEffect", "FittedForm", "Index", "Integers", "LimitCheck", "Mask", "MethodError",
+    "MonteCarlo", "Motion", "MovesError", "Multiply", "NoMonteCarlo", "Noise", "NotCalibrated", "NotIncluded",
+    "Note", "OverTemperature", "Parameters", "RankedFormula", "Recording", "Reduced", "Same", "SelectionErrors",
+    "SensorCalibration", "SensorDiagnosis", "SensorValidation", "StageResult", "StepErrors", "Subtract",
+    "TableEvidence", "TemperatureBin", "TwoSided", "UnitRecordings", "Validation", "Values", "Wander",
+    "WanderLikelihood", "base_units", "base_values", "calibrated", "conjugate_product", "continuous", "corrected",
+    "coverage_factor", "files_of_readings", "finite", "fit_from_json", "level_in_body", "matrix_of", "median",
+    "motion_at_rest", "noise_of_steps", "once", "once_of_log", "rate_of_attitude", "standard_uncertainty",
 ]  # fmt: skip

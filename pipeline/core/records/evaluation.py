@@ -164,7 +164,7 @@ class SensorValidation:
         )
 
 
-FEWEST_MOVES = 6  # held-out moves whose mean error counts: of fewer, one slip is a large share
+FEWEST_MOVES = 6  # held-out moves whose mean error counts; of fewer, the error weighted by its covariance
 KEYS_AS_THEY_ARE = (
     "unit", "held_out", "reason", "samples", "noise_floor", "vector_noise_floor", "reference_rms", "worse_than_raw",
 )  # fmt: skip
@@ -176,6 +176,12 @@ class MovesError(NamedTuple):
     rms_deg: float
     largest_deg: float  # largest rms that noise, scatter and uncertainties explain
     over_noise: float = 1.0  # mean error over that of noise alone; 1 for fewer than ``FEWEST_MOVES``
+    over_expected: float | None = None  # of these: weighted error over the largest that is expected
+
+    @property
+    def over_largest(self) -> float:
+        """The error over the largest that noise and uncertainties explain."""
+        return self.rms_deg / self.largest_deg if self.over_expected is None else self.over_expected
 
 
 @dataclass(frozen=True)
@@ -196,7 +202,8 @@ class Validation:
             return None
         several, floor = found["moves"] >= FEWEST_MOVES, found["noise_floor_deg"]
         over = found["mean_deg"]["after"] / floor if several and floor > 0.0 else 1.0
-        return MovesError(found["rms_deg"]["after"], found["largest_expected_rms_deg"], over)
+        expected = found["largest_expected_rms_deg"], over, found.get("over_expected")
+        return MovesError(found["rms_deg"]["after"], *expected)
 
     def to_json(self) -> dict[str, Any]:
         """Return the document."""

@@ -195,13 +195,37 @@ class GyroscopeModel:
     ) -> float:
         """Return the bound that the rms of ``direction_errors`` exceeds with a probability of 0.5 %, deg; simulated.
 
-        Errors of the accelerometer's calibration are drawn both for the directions and in the covariance, as if these
-        were independent; so the bound is too large rather than too small.
-
         ``covariance``: (p, p), of bias and matrix first. ``freedom``: (p,), degrees of freedom. ``scatter``: of moves
         and of directions, over the noise. ``ratio``: of bias wander to white noise.
         """
         block = self._of_moves(state)
+        drawn, _ = self._drawn_errors(block, covariance, freedom, scatter, ratio)
+        rms = np.sqrt(2.0 * np.mean((drawn * block.error) ** 2, axis=1))
+        return float(np.quantile(rms, 1.0 - INTERVAL_TAIL))
+
+    def weighted_direction_error(
+        self, state: State, covariance: Values, freedom: Values, scatter: tuple[float, float], ratio: float
+    ) -> float:
+        """Return ``sqrt(e^T S^-1 e)`` of the errors e of all moves, over what it exceeds with a probability of 0.5 %.
+
+        S is their covariance. Where a large error of one direction is likely, as by an axis that few rests determine,
+        it does not hide one of another direction. Parameters as of ``largest_direction_error``.
+        """
+        block = self._of_moves(state)
+        drawn, S = self._drawn_errors(block, covariance, freedom, scatter, ratio)
+        L = cholesky(S + block.base @ covariance[BASE, BASE] @ block.base.T)
+        sizes = [np.linalg.norm(np.linalg.solve(L, e), axis=0) for e in (block.residual, drawn.T)]
+        return float(sizes[0] / np.quantile(sizes[1], 1.0 - INTERVAL_TAIL))
+
+    @staticmethod
+    def _drawn_errors(
+        block: EquationBlock, covariance: Values, freedom: Values, scatter: tuple[float, float], ratio: float
+    ) -> tuple[Values, Values]:
+        """Return errors of moves over their white noise, (draws, n), and their covariance without the calibration's.
+
+        Errors of the accelerometer's calibration are drawn both for the directions and in the covariance, as if these
+        were independent; so bounds are too large rather than too small.
+        """
         n, H = len(block.residual), np.asarray(block.bias)
         S = (1.0 + scatter[0] ** 2) * np.eye(n) + np.asarray(block.common)
         S = S + scatter[1] ** 2 * np.asarray(block.direction)
@@ -212,9 +236,7 @@ class GyroscopeModel:
         for part in (BIAS, MATRIX):  # the wander reduces the degrees of freedom of the bias
             least = min(float(freedom[part].min()), NORMAL_DEGREES_OF_FREEDOM)
             errors[:, part] *= np.sqrt(least / rng.chisquare(least, (INTERVAL_DRAWS, 1)))
-        drawn += errors @ block.base.T
-        rms = np.sqrt(2.0 * np.mean((drawn * block.error) ** 2, axis=1))
-        return float(np.quantile(rms, 1.0 - INTERVAL_TAIL))
+        return drawn + errors @ block.base.T, S
 
     def _rate_at_rest(self, rests: Rests, force: Values, state: State) -> tuple[Values, Motion]:
         """Return the readings at rests minus those that the model predicts, (m, 3), and the motion."""

@@ -241,7 +241,7 @@ RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
     (Verdict.UNEXPLAINED, "above_as_the_residual", lambda e: e.above and e.at_noise is False),
     (Verdict.REFERENCE_IN_DOUBT, "contradiction", lambda e: e.above),
     (Verdict.UNEXPLAINED, "unexplained", lambda e: e.unexplained),
-    (Verdict.UNEXPLAINED, "moves", lambda e: e.moves and e.moves.rms_deg > e.moves.largest_deg and not e.missing),
+    (Verdict.UNEXPLAINED, "moves", lambda e: e.moves and e.moves.over_largest > 1.0 and not e.missing),
     (Verdict.UNEXPLAINED, "far_moves", lambda e: e.moves and e.moves.over_noise > MAX_OVER_NOISE and not e.missing),
     (Verdict.UNEXPLAINED, "scatter", lambda e: e.scatter > MAX_SCATTER_BY_HAND and not e.missing),
     (Verdict.MISSING_EFFECT, "missing", lambda e: e.missing),
@@ -269,7 +269,7 @@ FIGURE_OF: dict[str, Callable[[VerdictInput], str]] = {  # by the reason; of all
     "missing": lambda e: decided_words("misfit", e.over_noise),
     "static": lambda e: decided_words("static", _over(e.static, "high")),
     "unexplained": _of_residual,
-    "moves": lambda e: decided_words("angle_expected", e.moves.rms_deg / e.moves.largest_deg if e.moves else None),
+    "moves": lambda e: decided_words("angle_expected", e.moves.over_largest if e.moves else None),
     "far_moves": lambda e: decided_words("angle", e.moves.over_noise if e.moves else None),
     "scatter": lambda e: decided_words("scatter", e.scatter),
     "disagreement": lambda e: decided_words(

@@ -25,6 +25,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.records import (
     BASE,
     BIAS,
+    FEWEST_MOVES,
     MATRIX,
     Integers,
     Noise,
@@ -57,6 +58,7 @@ SHORTEST_DRIFT_S = 10.0  # s: a drift over a shorter time is mostly noise
 CURVE_POINTS = 120  # points of the published curves
 # largest steps of the complementary filter, which integrates to first order
 MAX_FILTER_STEP_S, MAX_FILTER_STEP_DEG = 0.1, 5.0
+STEADY_HAND = 3.0  # times the noise: largest scatter of moves that explains errors; 289 good hands fitted none
 FILTER_GAIN = 0.5  # of the complementary filter: its library's default
 TILT_SETTLING_S = 10.0  # s after which the tilt counts
 
@@ -220,8 +222,10 @@ def gravity_direction(
     It has ``reason`` (why there is none, else None), ``moves`` (number), ``mean_deg``, ``rms_deg`` and ``max_deg``
     (each ``before`` and ``after`` the gyroscope's calibration), ``noise_floor_deg`` (the mean by white noise alone),
     ``largest_expected_rms_deg`` (by noise and uncertainties, exceeded with a probability of 0.5 %; where the fit
-    determines the matrix) and ``creeping_rests`` (number of rests in which the unit turned slowly). Where the procedure
-    states turns, ``turns``: ``recording, time_s, axis, stated_deg`` and ``angle_deg`` (``before`` and ``after``).
+    determines the matrix), of fewer than ``FEWEST_MOVES`` ``over_expected`` (the errors weighted by their covariance,
+    with the scatter of a steady hand, over what they exceed with this probability) and ``creeping_rests`` (number of
+    rests in which the unit turned slowly). Where the procedure states turns, ``turns``: ``recording, time_s, axis,
+    stated_deg`` and ``angle_deg`` (``before`` and ``after``).
     """
     if not is_multi_position("gyroscope", recordings):
         return {"reason": "not recorded by hand"}
@@ -249,10 +253,11 @@ def gravity_direction(
         ratio = 0.0 if noise is None else float(np.mean(noise.wander / np.maximum(noise.white, 1e-300)))
         details = gyroscope.stages[-1].details if gyroscope.stages else {}
         moves, directions = (float(details.get(f"scatter_of_{each}") or 0.0) for each in ("moves", "directions"))
-        covariance, freedom = covariance_without_reference(gyroscope), gyroscope.parameters.degrees_of_freedom
-        found["largest_expected_rms_deg"] = model.largest_direction_error(
-            states["after"], covariance, freedom, (moves, directions), ratio
-        )
+        of_fit = states["after"], covariance_without_reference(gyroscope), gyroscope.parameters.degrees_of_freedom
+        found["largest_expected_rms_deg"] = model.largest_direction_error(*of_fit, (moves, directions), ratio)
+        if model.moves.count < FEWEST_MOVES:
+            steady = min(moves, STEADY_HAND), min(directions, STEADY_HAND)
+            found["over_expected"] = model.weighted_direction_error(*of_fit, steady, ratio)
     if turns:
         found["turns"] = [
             {**after, "angle_deg": {"before": before["angle_deg"], "after": after["angle_deg"]}}

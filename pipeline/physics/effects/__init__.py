@@ -25,7 +25,7 @@ from imu_logs.yaml_file import load_yaml
 from pipeline.core.errors import ConfigurationError, MissingInputError, PipelineError
 from pipeline.core.files import CONFIGS
 from pipeline.physics.effects.base import Effect
-from pipeline.physics.effects.formula_effect import FormulaEffect, read_declaration
+from pipeline.physics.effects.formula_effect import FormulaEffect, fitted_anyway, read_declaration
 from pipeline.physics.effects.mounting import SETUP_EFFECTS, in_session
 
 if TYPE_CHECKING:
@@ -203,6 +203,10 @@ def read_effect_file(file: Path, *, built_in: bool = False) -> Effect:
         raise ConfigurationError("an effect is expected: name, owner, sensors, meaning, terms", str(file))
     lines = partial(_lines, text)
     made = effect_from(given, str(file), lines, built_in=built_in)
+    if not built_in and isinstance(made, FormulaEffect):
+        for term, what in fitted_anyway(made.declared).items():
+            place = f"{file}:{lines().get(('terms', term), 1)}"
+            raise ConfigurationError(f"terms.{term}: {what}", place)
     if made.name != file.stem:
         place = f"{file}:{lines().get(('name',), 1)}"
         raise ConfigurationError(f"the effect is called {made.name}, the file {file.stem}: give both one name", place)

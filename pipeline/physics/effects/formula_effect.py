@@ -47,7 +47,7 @@ from pipeline.physics.effects.base import (
 from pipeline.physics.formula import OF_THE_MOTION, SIGNALS, Formula, c_number, parse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     Signals = Mapping[str, Values | None]  # None: the recording has no turn axis
 
@@ -59,6 +59,7 @@ AS_DECLARED = (
 OF_THE_TURN = ("angle", "rate")
 OPTIONAL_FIELDS = ("temperature", "angle", "rate", "level")  # fields that a motion may lack
 TRUTHS = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
+OWN = {"accelerometer": "f", "gyroscope": "w"}  # signals of that field
 
 
 class DeclaredEffect(Effect):
@@ -225,6 +226,8 @@ def _of(motion: Motion, before: str = " of recording") -> str:
 EFFECT_NAME = re.compile(r"[a-z][a-z0-9_]{0,49}")
 TERM = re.compile(r"[A-Za-z](?=.{0,19}$)[A-Za-z0-9_]*\*?[A-Za-z0-9_]*")
 RESERVED = ("auto", "all", "none")
+NUMBER = re.compile(r"(?<![\w.])\d+\.?\d*(?:e[-+]?\d+)?")
+PROBES, ALIKE = 200, 1e-9  # places; largest relative difference, by rounding, of values that are equal
 MOST_TERMS, LONGEST_TEXT, LONGEST_UNIT = 12, 500, 30  # above every built-in effect; they limit pages and fits
 
 
@@ -434,6 +437,46 @@ def _check_consistency(declared: Declaration) -> None:
         raise WrongValueError(f"a limit for each term is expected ({', '.join(terms)}), or none at all", "limits")
     for name, size in declared.limits.items():
         _check_sensors(declared, size, "limit", "limits", name)
+
+
+def fitted_anyway(declared: Declaration) -> dict[str, str]:
+    """Return the terms that any fit has in bias and matrix, with what they are, in words."""
+    found: dict[str, str] = {}
+    for name, term in declared.terms.items():
+        formulas = [(term.formulas.get(a) or term.formulas[""]).text for a in AXES]
+        for sensor in declared.sensors:
+            if what := _of_bias_and_matrix(sensor, formulas):
+                found[name] = f"for the {sensor} the formula is {what}, whatever is recorded: that is fitted anyway"
+    return found
+
+
+def _of_bias_and_matrix(sensor: str, formulas: Sequence[str]) -> str:
+    """Return the parameters of bias and matrix whose change a term equals at any signals; empty for other terms.
+
+    ``formulas``: of x, y and z. Each is evaluated at signals of sizes from 0.001 to 1000 and near its own numbers.
+    """
+    rng = np.random.default_rng(0)
+    numbers = [float(text) for text in NUMBER.findall(" ".join(formulas))]
+    sizes = rng.choice([-1.0, 1.0], PROBES) * 10.0 ** rng.uniform(-3.0, 3.0, (len(SIGNALS), PROBES))
+    near = np.repeat(numbers, PROBES) * (1.0 + 0.1 * rng.standard_normal((len(SIGNALS), PROBES * len(numbers))))
+    drawn = dict(zip(SIGNALS, np.concatenate([sizes, near], axis=1), strict=True))
+    own = [drawn[f"{OWN[sensor]}{a}"] for a in AXES]
+    base, constant = np.stack([np.ones_like(own[0]), *own], axis=1), True
+    adds = False
+    for formula, u in zip(formulas, own, strict=True):
+        values = np.broadcast_to(parse(formula)({**drawn, "u": u}), len(u))
+        known = np.isfinite(values)
+        if np.count_nonzero(known) < PROBES // 4:
+            return ""
+        scale = np.linalg.norm(base[known], axis=0)
+        solved, *_ = np.linalg.lstsq(base[known] / scale, values[known])
+        if np.abs(base[known] / scale @ solved - values[known]).max() > ALIKE * np.abs(values[known]).max():
+            return ""
+        constant &= bool(np.abs(solved[1:]).max() <= ALIKE * np.abs(solved[0]))
+        adds |= bool(values[known].any())
+    if not adds:
+        return ""
+    return "a constant, which is the bias" if constant else "a combination of bias and matrix"
 
 
 def _check_sensors(declared: Declaration, given: object, what: str, *path: str) -> None:
