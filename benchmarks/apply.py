@@ -25,7 +25,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-from pipeline.core.records import FittedEffect, SensorCalibration
+from pipeline.core.records import Coefficient, FittedEffect, SensorCalibration
 
 EFFECTS = {
     "linear": {},
@@ -47,7 +47,7 @@ def write_calibration(path: Path, effects: dict[str, dict[str, float]]) -> None:
         chosen = []
         for name, size in effects.get(sensor, {}).items():
             parameters = {
-                p.name: {"value": size * generator.uniform(-1, 1), "unit": p.unit, "expanded_uncertainty": 0.0}
+                p.name: Coefficient(size * generator.uniform(-1, 1), p.unit, 0.0)
                 for p in effect(name).parameters(sensor)
             }
             chosen.append(FittedEffect(name, parameters))

@@ -40,13 +40,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
 from pipeline.core.errors import NotObservableError
-from pipeline.core.records import Index, Values, noise_of_steps
+from pipeline.core.records import Convergence, Index, Values, noise_of_steps
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting, WanderPrior
 
 if TYPE_CHECKING:
@@ -384,7 +384,6 @@ def derivative(function: Callable[[Values], Values], x: Values, step: Values) ->
 
 RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
 PART_OF_NULL_SPACE = 1e-3  # component of a unit vector of it, above which a parameter is named as not determined
-COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, times a factor for sums over many residuals
 ROW_SUM_RIDGE = 1e-9  # 1e7 times the rounding of a double, for sums over many rows; 3e-5 of a standard deviation
 
 
@@ -466,8 +465,8 @@ def cholesky(matrix: Values) -> Values:
         return np.asarray(np.linalg.cholesky(matrix + ROW_SUM_RIDGE * diagonal), np.float64)
 
 
-def linear_convergence_evidence(A: Values, residual: Values, condition: float, rank: int) -> dict[str, Any]:
-    """Return the evidence that a linear estimate is a minimum, for ``SensorCalibration.convergence``.
+def linear_convergence(A: Values, residual: Values, condition: float, rank: int) -> Convergence:
+    """Return the evidence that a linear estimate is a minimum.
 
     ``A``: (n, p), columns, the same for each channel. ``residual``: (n,) or (n, m), of m channels. ``condition``: of
     the scaled columns.
@@ -475,17 +474,4 @@ def linear_convergence_evidence(A: Values, residual: Values, condition: float, r
     products = np.abs(A.T @ residual)
     size = np.multiply.outer(np.linalg.norm(A, axis=0), np.linalg.norm(residual, axis=0))
     cosine = np.divide(products, size, out=np.zeros_like(products), where=size > 0.0)
-    return convergence_evidence(float(cosine.max()), condition, rank, A.shape[1])
-
-
-def convergence_evidence(
-    cosine: float, condition: float, rank: int, parameters: int, *, at_minimum: float = COSINE_AT_MINIMUM
-) -> dict[str, Any]:
-    """Return the evidence that a fit is at its minimum, for ``SensorCalibration.convergence``."""
-    return {
-        "cosine": cosine,
-        "cosine_at_minimum": at_minimum,
-        "condition": condition if np.isfinite(condition) else None,
-        "rank": rank,
-        "parameters": parameters,
-    }
+    return Convergence(float(cosine.max()), condition, rank, A.shape[1])

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,9 +32,11 @@ from pipeline.core.records import (
     MATRIX,
     NORMAL,
     Contribution,
+    Convergence,
     Noise,
     Recording,
     SensorCalibration,
+    StageDetails,
     StageResult,
     Values,
     base_values,
@@ -51,13 +53,7 @@ from pipeline.estimation.design import (
     stepped,
     without_unknown_motion,
 )
-from pipeline.estimation.engine import (
-    MIN_EIGENVALUE_SHARE,
-    ErrorMixture,
-    ResidualNoise,
-    convergence_evidence,
-    noise_outside_known_errors,
-)
+from pipeline.estimation.engine import MIN_EIGENVALUE_SHARE, ErrorMixture, ResidualNoise, noise_outside_known_errors
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, selection_grid
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import wander_prior
@@ -400,15 +396,15 @@ def calibration_of(
         ]
         fit = replace(fit, terms=tuple(terms))
         effects, parameters = effect_parameters(sensor, fit.terms, covariance)
-    details: dict[str, Any] = {
-        "samples": round(observations.samples),
-        "rounds": fit.rounds,
-        "condition": fit.condition,
-        "wander_ratio": fit.setting.ratio,
-        "wander_time_s": fit.setting.time,
-    }
-    if before is not None and before.stages:  # bias and matrix are fitted again, from ordinary least squares
-        details["replaces"] = before.stages[-1].name
+    details = StageDetails(
+        samples=round(observations.samples),
+        rounds=fit.rounds,
+        condition=fit.condition,
+        wander_ratio=fit.setting.ratio,
+        wander_time_s=fit.setting.time,
+        # bias and matrix are fitted again, from ordinary least squares
+        replaces=before.stages[-1].name if before is not None and before.stages else None,
+    )
     stage = StageResult("effects", parameters, fit.residual_rms, None, details)
     found = replace(
         before or SensorCalibration(sensor),
@@ -417,7 +413,7 @@ def calibration_of(
         stages=(*(before.stages if before else ()), stage),
         effects=effects,
         converged=fit.converged,
-        convergence=convergence_evidence(fit.cosine, fit.condition, fit.rank, len(covariance)),
+        convergence=Convergence(fit.cosine, fit.condition, fit.rank, len(covariance)),
     )
     if settings is None:
         return combined(found, [scatter_contribution(covariance, fit.degrees_of_freedom)], {})

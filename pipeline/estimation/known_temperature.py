@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.records import Estimate, FittedEffect, SensorCalibration, StageResult
+from pipeline.core.records import Coefficient, Estimate, FittedEffect, SensorCalibration, StageResult
 from pipeline.estimation.stages import FitStage, known_effects
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
@@ -48,7 +48,7 @@ def known(sensor: str, data_sheet: DataSheet) -> list[FittedEffect]:
         FittedEffect(
             name,
             {
-                p.name: {"value": value, "unit": p.unit, "expanded_uncertainty": None}
+                p.name: Coefficient(value, p.unit)
                 for p, value in zip(effect(name).parameters(sensor), of_axes.tolist(), strict=True)
             },
         )
@@ -65,7 +65,5 @@ def fit(
     """Return the known effects as a calibration without bias and matrix (``pipeline.estimation.stages``)."""
     del recordings, previous  # it is the first stage
     effects = known_effects(sensor, settings.method)
-    parameters = {
-        f"{e.name}.{name}": Estimate(p["value"], p["unit"]) for e in effects for name, p in e.parameters.items()
-    }
+    parameters = {f"{e.name}.{name}": Estimate(p.value, p.unit) for e in effects for name, p in e.parameters.items()}
     return SensorCalibration(sensor, effects=effects, stages=(StageResult(NAME, parameters),))

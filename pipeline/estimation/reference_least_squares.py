@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, NotObservableError
-from pipeline.core.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageResult, Values
+from pipeline.core.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageDetails, StageResult, Values
 from pipeline.estimation.candidates import bench_effects
-from pipeline.estimation.engine import LinearMap, ScaledColumns, linear_convergence_evidence
+from pipeline.estimation.engine import LinearMap, ScaledColumns, linear_convergence
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import wander_prior
@@ -88,22 +88,22 @@ def fit(
         name=NAME,
         parameters=base_parameters(sensor, bias, matrix, contributions[0].covariance),
         residual_rms=float(np.sqrt(np.mean(residuals**2))),
-        details={
-            "condition": condition,
-            "samples_used": len(y),
-            "samples_left_out": sum(part.recording.samples for part in parts) - len(y),
-            "residual_rms": np.sqrt(np.mean(residuals**2, axis=0)).tolist(),
-            "white_noise": noise.white.tolist(),
-            "bias_wander": noise.wander.tolist(),
-            "degrees_of_freedom": float(contributions[0].degrees_of_freedom.min()),
-        },
+        details=StageDetails(
+            condition=condition,
+            samples_used=len(y),
+            samples_left_out=sum(part.recording.samples for part in parts) - len(y),
+            residual_rms=np.sqrt(np.mean(residuals**2, axis=0)).tolist(),
+            white_noise=noise.white.tolist(),
+            bias_wander=noise.wander.tolist(),
+            degrees_of_freedom=float(contributions[0].degrees_of_freedom.min()),
+        ),
     )
     found = SensorCalibration(
         sensor=sensor,
         bias=bias,
         matrix=matrix,
         stages=(*(previous.stages if previous else ()), result),
-        convergence=linear_convergence_evidence(X, residuals, condition, rank),
+        convergence=linear_convergence(X, residuals, condition, rank),
     )
 
     def results(errors: Values) -> Values:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError
-from pipeline.core.records import NOISE_OF_ROWS, once
+from pipeline.core.records import NOISE_OF_ROWS, RestUse, once
 from pipeline.estimation.turns import stop_and_go
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.physics.kinematics import table_motion
@@ -23,7 +23,7 @@ from pipeline.physics.signal.quiet_motion import creep_of_rest, posterior_creep_
 from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, usable
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from pipeline.core.records import Index, Integers, Mask, Recording, SensorCalibration, Values
     from pipeline.core.settings import Procedure, Settings, Table
@@ -95,7 +95,7 @@ def advice_on_held_out(recordings: Sequence[Recording], procedure: Procedure) ->
 
 
 def rests_by_use(recordings: Sequence[Recording], procedure: Procedure) -> dict[str, list[dict[str, Any]]]:
-    """Describe the rests of the recordings of role ``rests`` by their use in a fit: see ``describe_rests``.
+    """Describe the rests of the recordings of role ``rests`` by their use in a fit, for a document: see ``RestUse``.
 
     The keys are ``rests_used``, ``rests_held_out`` and ``rests_left_out``. Rests that the fit itself excludes later are
     listed as used.
@@ -103,23 +103,23 @@ def rests_by_use(recordings: Sequence[Recording], procedure: Procedure) -> dict[
     every = holdout_interval(recordings, procedure)
     splits = [(r, split_rests(r, every)) for r in recordings if r.role == ROLE]
     return {
-        f"rests_{use}": describe_rests([(r, rest) for r, split in splits for rest in getattr(split, use)])
+        f"rests_{use}": [vars(u) for u in rest_uses((r, rest) for r, split in splits for rest in getattr(split, use))]
         for use in ("used", "held_out", "left_out")
     }
 
 
-def describe_rests(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, Any]]:
-    """Return each rest's recording, start and duration in s, and the reason why it is refused (empty if accepted)."""
+def rest_uses(pairs: Iterable[tuple[Recording, Rest]]) -> list[RestUse]:
+    """Return the descriptions of rests."""
     return [
-        {
-            "recording": recording.name,
-            "time_s": float(recording.time[rest.start]),
-            "duration_s": float(recording.time[rest.stop - 1] - recording.time[rest.start]),
-            "creep_dps": 0.0  # where it is not significant
+        RestUse(
+            recording=recording.name,
+            time_s=float(recording.time[rest.start]),
+            duration_s=float(recording.time[rest.stop - 1] - recording.time[rest.start]),
+            creep_dps=0.0
             if recording.accelerometer is None
             else float(np.linalg.norm(creep_of_rest(recording, rest.start, rest.stop).rate)),
-            "reason": rest.reason,
-        }
+            reason=rest.reason,
+        )
         for recording, rest in pairs
     ]
 
@@ -254,9 +254,9 @@ def rests_of(
     """
     every = holdout_interval(recordings, procedure) if role == ROLE else 0
     refused = {
-        (rest["recording"], float(rest["time_s"]))
+        (rest.recording, rest.time_s)
         for stage in (accelerometer.stages if accelerometer else ())
-        for rest in stage.details.get("rests_left_out", ())
+        for rest in stage.details.rests_left_out or ()
     }
     chosen: dict[int, list[Rest]] = {}
     held: set[tuple[int, int]] = set()

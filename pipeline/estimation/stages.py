@@ -53,6 +53,7 @@ from pipeline.core.records import (
     NotIncluded,
     Recording,
     SensorCalibration,
+    StageDetails,
     StageResult,
     UnitRecordings,
     Values,
@@ -78,7 +79,7 @@ SOURCE = "known effects"  # of the uncertainty budget
 def known_effects(sensor: str, method: Method) -> tuple[FittedEffect, ...]:
     """Return the effects that the method of a sensor knows before the fit (``method.known``)."""
     entries = [] if method.known is None else method.known.get(sensor, [])
-    return tuple(FittedEffect(**entry) for entry in entries)
+    return tuple(FittedEffect.from_json(entry) for entry in entries)
 
 
 def subtracted(
@@ -166,8 +167,7 @@ def without_known(calibration: SensorCalibration, known: Sequence[FittedEffect])
 
 def _moved(effect: FittedEffect, by: Values) -> FittedEffect:
     """Return an effect that is linear in its parameters with other values."""
-    pairs = zip(effect.parameters.items(), (effect.values + by).tolist(), strict=True)
-    return replace(effect, parameters={name: {**parameter, "value": value} for (name, parameter), value in pairs})
+    return effect.at((effect.values + by).tolist())
 
 
 def without_known_effects(
@@ -352,7 +352,7 @@ def given_calibration(sensor: str, method: Method) -> SensorCalibration:
     every = found.parameters
     kept = every.select(every.places([name for name in every.names if name.partition(".")[0] not in bench]))
     parameters = base_parameters(sensor, found.bias, found.matrix, kept.covariance[BASE, BASE])
-    details = {"source": source, "sha256": given["sha256"], "notes": given["notes"], "left_out": bench}
+    details = StageDetails(source=source, sha256=given["sha256"], notes=given["notes"], left_out=bench)
     stage = StageResult(GIVEN, parameters, details=details)
     effects = tuple(e for e in found.effects if e.name not in bench)
     calibration = SensorCalibration(sensor, found.bias, found.matrix, effects=effects, stages=(stage,))
@@ -387,11 +387,11 @@ def staged_result(  # noqa: PLR0917  (the results of a stage)
     degrees_of_freedom: Values,
 ) -> StageResult:
     """Return the result of a stage; ``error``: of the magnitude of each sample; ``samples``: those used, and all."""
-    details = {
-        "samples_used": samples[0],
-        "samples_left_out": samples[1] - samples[0],
-        "white_noise": noise.white.tolist(),
-        "bias_wander": noise.wander.tolist(),
-        "degrees_of_freedom": float(degrees_of_freedom.min()),
-    }
+    details = StageDetails(
+        samples_used=samples[0],
+        samples_left_out=samples[1] - samples[0],
+        white_noise=noise.white.tolist(),
+        bias_wander=noise.wander.tolist(),
+        degrees_of_freedom=float(degrees_of_freedom.min()),
+    )
     return StageResult(name, parameters, float(np.sqrt(np.mean(error**2))), tuple(steps), details)

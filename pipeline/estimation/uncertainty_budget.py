@@ -52,9 +52,11 @@ from pipeline.core.records import (
     RECTANGULAR,
     SENSOR_UNITS,
     Budget,
+    Coefficient,
     Contribution,
     Estimate,
     FittedEffect,
+    NoiseParts,
     NotIncluded,
     SensorCalibration,
     Values,
@@ -251,20 +253,18 @@ def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: WanderPrior)
     white, wander = noise.variances(fit, prior)
     white = np.clip(white, 0.0, np.clip(total, 0.0, None))  # rounding may leave a negative zero
     wander = np.clip(wander, 0.0, np.clip(total - white, 0.0, None))
-    parts = {
-        "white noise": np.sqrt(white),
-        "bias wander": np.sqrt(wander),
-        "lack of fit": np.sqrt(np.clip(total - white - wander, 0.0, None)),
-    }
+    parts = NoiseParts(np.sqrt(white), np.sqrt(wander), np.sqrt(np.clip(total - white - wander, 0.0, None)))
     return Contribution(NOISE_SOURCE, "A", "Student's t", covariance, freedom, parts=parts)
 
 
 def scatter_contribution(
-    covariance: Values, degrees_of_freedom: float, parts: Mapping[str, Values] | None = None, remark: str = ""
+    covariance: Values, degrees_of_freedom: float, parts: NoiseParts | None = None, remark: str = ""
 ) -> Contribution:
     """Return the contribution of the readings' scatter for a fit that computes its covariance directly."""
     freedom = np.full(len(covariance), float(degrees_of_freedom))
-    return Contribution(NOISE_SOURCE, "A", "Student's t", covariance, freedom, parts=dict(parts or {}), remark=remark)
+    return Contribution(
+        NOISE_SOURCE, "A", "Student's t", covariance, freedom, parts=parts or NoiseParts(), remark=remark
+    )
 
 
 def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float, unit: str) -> Contribution | str:
@@ -406,16 +406,17 @@ def covariance_without_reference(calibration: SensorCalibration) -> Values:
     return out
 
 
-def own_and_bench(calibration: SensorCalibration, shared: str = "") -> tuple[Values, Values]:
+def own_and_bench(calibration: SensorCalibration, *, with_lack_of_fit: bool = False) -> tuple[Values, Values]:
     """Divide the covariance of a calibration into the parts from its readings and from the bench.
 
-    ``shared``: a part of the readings' contribution that is also counted for the bench.
+    ``with_lack_of_fit``: whether the bench has the lack of fit, a part of the readings' contribution, too.
     """
     C = calibration.parameters.covariance
     of_bench = np.zeros(len(C))
     for line in calibration.lines:
-        part, whole = np.square(line.parts.get(shared, 0.0)), np.square(line.standard_uncertainty)
-        of_bench += np.where(part > CHANCE_VARIANCE_SHARE * whole, part, 0.0)
+        part, whole = line.parts.lack_of_fit, np.square(line.standard_uncertainty)
+        if with_lack_of_fit and part is not None:
+            of_bench += np.where(part**2 > CHANCE_VARIANCE_SHARE * whole, part**2, 0.0)
         of_bench += whole * (line.kind == "B" and line.source != LIMIT)
     share = np.clip(of_bench / np.maximum(np.diag(C), 1e-300), 0.0, 1.0)
     return C * np.sqrt(np.outer(1.0 - share, 1.0 - share)), C * np.sqrt(np.outer(share, share))
@@ -441,9 +442,9 @@ def effect_parameters(
     effects, parameters = [], {}
     for term in terms:
         pairs = zip(term.effect.parameters(sensor), term.values.tolist(), strict=True)
-        described = {p.name: {"value": value, "unit": p.unit} for p, value in pairs}
-        for name, shared in described.items():
-            parameters[f"{term.effect.name}.{name}"] = Estimate(**shared, standard_uncertainty=next(u) or None)
+        described = {p.name: Coefficient(value, p.unit) for p, value in pairs}
+        for name, p in described.items():
+            parameters[f"{term.effect.name}.{name}"] = Estimate(p.value, p.unit, next(u) or None)
         effects.append(FittedEffect(term.effect.name, described, term.effect.definition))
     return tuple(effects), parameters
 
@@ -456,7 +457,7 @@ def with_uncertainty(
     known = freedom[complete.standard_uncertainty > 0.0]
     expanded, effects = iter(complete.expanded_uncertainty.tolist()[AFTER_BASE]), []
     for one in calibration.effects:
-        parameters = {n: {**p, "expanded_uncertainty": next(expanded) or None} for n, p in one.parameters.items()}
+        parameters = {n: replace(p, expanded_uncertainty=next(expanded) or None) for n, p in one.parameters.items()}
         effects.append(replace(one, parameters=parameters))
     return replace(
         calibration,

@@ -196,7 +196,7 @@ def _check_matrix(file: Path, key: str, matrix: np.ndarray) -> None:
 def _check_effect(file: Path, where: str, sensor: str, entry: dict[str, Any]) -> None:
     name, parameters = entry["name"], entry["parameters"]
     try:
-        effect = effect_of(FittedEffect(name, parameters, entry.get("definition")))
+        effect = effect_of(FittedEffect(name, {}, entry.get("definition")))
     except ConfigurationError as error:
         raise ConfigurationError(f"{where}: {error.message}", str(file)) from None
     known = effect.parameters(sensor) if sensor in effect.sensors else ()

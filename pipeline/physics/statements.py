@@ -46,7 +46,6 @@ from pipeline.core.records import (
     BIAS_NAMES,
     LIMIT,
     SENSOR_UNITS,
-    TURN_AXES,
     FittedEffect,
     SensorCalibration,
     Values,
@@ -270,7 +269,7 @@ def limited_effects(sensor: str, part: Mapping[str, Any], limits: Mapping[str, f
     """Yield the rows of the effects' parameters that have an uncertainty and a limit; ``limits``: of the effects."""
     for entry in part.get("effects") or []:
         try:
-            effect = effect_of(FittedEffect(entry["name"], entry["parameters"], entry.get("definition")))
+            effect = effect_of(FittedEffect(entry["name"], {}, entry.get("definition")))
         except ConfigurationError:
             continue  # an effect in Python that is not loaded here: its limits are unknown
         sizes = parameter_limits(effect, sensor, limits)
@@ -359,7 +358,7 @@ def not_determined(part: Mapping[str, Any]) -> str:
     if "matrix_" in names:
         about = [axis for axis in "xyz" if f"matrix_{axis}{axis}" in names]
         ways = [f"turn the unit about {' and '.join(about)} by a known angle"] if about else []
-        axes = next((d for stage in part["stages"] if (d := stage["details"].get(TURN_AXES))), None)
+        axes = next((d for stage in part["stages"] if (d := stage["details"].get("turn_axes"))), None)
         if axes and axes["stated_deg"] > axes["needed_deg"]:
             needed = np.floor(100.0 * axes["needed_deg"]) / 100.0
             ways.append(

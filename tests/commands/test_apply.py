@@ -14,7 +14,7 @@ from pipeline.app.commands.apply import main
 from pipeline.app.field_logs.compensate import compensate_log
 from pipeline.app.field_logs.stream import LogProfile
 from pipeline.core.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
-from pipeline.core.records import FittedEffect, SensorCalibration
+from pipeline.core.records import Coefficient, FittedEffect, SensorCalibration
 from pipeline.physics.compensation import load
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ VALUES = [*(f"accel_{a}_g" for a in "xyz"), *(f"gyro_{a}_dps" for a in "xyz")]
 
 
 def effect(name: str, **values: float) -> FittedEffect:
-    return FittedEffect(name, {k: {"value": v, "unit": "", "expanded_uncertainty": 0.0} for k, v in values.items()})
+    return FittedEffect(name, {k: Coefficient(v, "", 0.0) for k, v in values.items()})
 
 
 def nine(symbol: str, value: float) -> dict[str, float]:

@@ -21,7 +21,7 @@ from pipeline.app.commands.apply import main
 from pipeline.app.field_logs.compensate import compensate_log
 from pipeline.app.field_logs.stream import LogProfile
 from pipeline.core.errors import InputError
-from pipeline.core.records import SENSORS, FittedEffect, Recording, SensorCalibration
+from pipeline.core.records import SENSORS, Coefficient, FittedEffect, Recording, SensorCalibration
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.physics.compensation import load
 
@@ -35,7 +35,7 @@ COUNT = 3000
 
 
 def effect(name: str, **values: float) -> FittedEffect:
-    return FittedEffect(name, {k: {"value": v, "unit": "", "expanded_uncertainty": 0.0} for k, v in values.items()})
+    return FittedEffect(name, {k: Coefficient(v, "", 0.0) for k, v in values.items()})
 
 
 @pytest.fixture

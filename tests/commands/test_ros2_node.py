@@ -16,7 +16,7 @@ from pipeline.app.commands.apply import main as apply_main
 from pipeline.app.field_logs import ros2_node
 from pipeline.app.field_logs.ros2_node import MessageCalibrator
 from pipeline.core.files import write_json
-from pipeline.core.records import FittedEffect, Recording, SensorCalibration
+from pipeline.core.records import Coefficient, FittedEffect, Recording, SensorCalibration
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.ingest.arrow import write_recording
 
@@ -30,9 +30,9 @@ AXES = ["-y", "+x", "+z"]
 @pytest.fixture
 def calibration(tmp_path: Path) -> Path:
     values = {"b_T_x": 0.1, "b_T_y": 0.2, "b_T_z": -0.1}
-    warm = FittedEffect("bias_temperature", {k: {"value": v, "unit": "deg/s/degC"} for k, v in values.items()})
+    warm = FittedEffect("bias_temperature", {k: Coefficient(v, "deg/s/degC") for k, v in values.items()})
     names = [f"G_{a}{b}" for a in "xyz" for b in "xyz"]
-    G = FittedEffect("g_sensitivity", {n: {"value": 0.01 * i, "unit": "deg/s/g"} for i, n in enumerate(names)})
+    G = FittedEffect("g_sensitivity", {n: Coefficient(0.01 * i, "deg/s/g") for i, n in enumerate(names)})
     parts = {
         "accelerometer": SensorCalibration(
             "accelerometer", np.array([0.02, -0.01, 0.03]), np.diag([1.01, 0.99, 1.02]) + 0.003

@@ -35,7 +35,6 @@ SAME_MEANING = {
     "BUILT_IN": "how the file of a built-in effect states that it is one",
     "GIVEN": "the method of a given calibration",
     "GROUPS": "of Hydra",
-    "LACK_OF_FIT": "source of a budget",
     "NANOSECONDS": "in a second",
     "SILENT": "no noise",
     "EFFECTS_FOLDER": "files of the built-in effects",

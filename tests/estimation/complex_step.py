@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.engine import COSINE_AT_MINIMUM, ScaledColumns, linear_convergence_evidence
+from pipeline.core.records.calibration import COSINE_AT_MINIMUM
+from pipeline.estimation.engine import ScaledColumns, linear_convergence
 from pipeline.estimation.multi_position.fit import MAX_STEP_HALVINGS
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class Solved:
     @property
     def cosine(self) -> float:
         """Largest cosine between the residual and a column."""
-        return float(linear_convergence_evidence(self.columns, self.residual, 1.0, len(self.x))["cosine"])
+        return float(linear_convergence(self.columns, self.residual, 1.0, len(self.x)).cosine)
 
     @property
     def converged(self) -> bool:

@@ -59,9 +59,9 @@ def test_rests_that_nearly_lie_in_one_plane_are_refused_too(lean: float) -> None
 def test_rests_well_out_of_the_plane_are_answered_within_their_uncertainty() -> None:
     found = fit(with_noise(at_rest_in(in_a_plane(24, out_of_it=50.0)), SETTINGS), None, SETTINGS)
     assert np.all(np.abs(found.bias - BIAS) < 4.0 * np.sqrt(np.diag(found.covariance)[:3]))
-    assert found.convergence["rank"] == found.convergence["parameters"]
-    assert 1.0 < found.convergence["condition"] < 100.0
-    assert found.convergence["cosine"] <= found.convergence["cosine_at_minimum"]
+    assert found.convergence.rank == found.convergence.parameters
+    assert 1.0 < found.convergence.condition < 100.0
+    assert found.convergence.cosine <= found.convergence.cosine_at_minimum
 
 
 def test_rests_in_one_direction_alone_are_refused() -> None:
@@ -137,5 +137,5 @@ def test_a_gyroscope_whose_moves_do_not_determine_it_is_null_beside_its_accelero
 
 def test_moves_about_all_axes_are_answered() -> None:
     found = rests_and_moves.fit(with_noise(turned_by_hand("xyz"), BOTH), None, BOTH)
-    assert found.convergence["rank"] == found.convergence["parameters"] == 12
+    assert found.convergence.rank == found.convergence.parameters == 12
     assert np.abs(found.matrix - np.eye(3)).max() < 0.01

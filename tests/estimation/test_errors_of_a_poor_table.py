@@ -44,9 +44,9 @@ def _ratios(found: list[SensorCalibration], true: list[np.ndarray]) -> np.ndarra
 @pytest.mark.parametrize(("sensor", "shown"), [("accelerometer", 3.0), ("gyroscope", 1.0)])
 def test_the_noise_of_the_readings_is_the_sensor_s_and_not_the_table_s(sensor: str, shown: float) -> None:
     found = [fit(sensor, with_noise(_unit(n)[0], SETTINGS), None, SETTINGS) for n in range(UNITS)]
-    white = np.array([f.stages[-1].details["white_noise"] for f in found])
+    white = np.array([f.stages[-1].details.white_noise for f in found])
     true = _unit(0)[1][sensor]["noise"]["white"]
-    residual = np.array([f.stages[-1].details["residual_rms"] for f in found])
+    residual = np.array([f.stages[-1].details.residual_rms for f in found])
     assert residual.mean() > shown * true
     assert white.mean() == pytest.approx(true, rel=0.1)
     truths = [_unit(n)[1][sensor] for n in range(UNITS)]

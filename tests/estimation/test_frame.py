@@ -5,7 +5,7 @@ import pytest
 from unit_settings import settings_of
 
 from pipeline.app.steps.calibration import frame_uncertainty
-from pipeline.core.records import FittedEffect, Recording, SensorCalibration
+from pipeline.core.records import Coefficient, FittedEffect, Recording, SensorCalibration
 from pipeline.physics.kinematics import turn_by_vector
 from pipeline.physics.statements import OF_FRAME, beyond_uncertainty, frame_words
 
@@ -38,9 +38,7 @@ def test_the_frame_on_a_table_is_that_of_the_mean_mounting() -> None:
 
 
 def test_fitted_mountings_that_differ_by_more_than_is_stated_widen_the_frame() -> None:
-    values = {
-        f"m_{i}": {"value": v, "unit": "deg"} for i, v in enumerate([3.0, 0.0, 0.1, 0.0, 0.0, 0.0, -3.0, 0, -0.1])
-    }
+    values = {f"m_{i}": Coefficient(v, "deg") for i, v in enumerate([3.0, 0.0, 0.1, 0.0, 0.0, 0.0, -3.0, 0, -0.1])}
     fitted = SensorCalibration("accelerometer", effects=(FittedEffect("mounting", values),))
     found = frame_uncertainty(fitted, TURNS, settings_of(**{"table.seat_deg": 1.0}))
     assert found == pytest.approx([NORMAL * 3.0 / np.sqrt(3.0), NORMAL / np.sqrt(3.0), NORMAL / np.sqrt(3.0)])

@@ -58,8 +58,8 @@ def test_the_order_of_the_effects_is_kept_with_units_and_expanded_uncertainties(
     assert [e.name for e in calibration.effects] == names
     assert calibration.parameters.names[-1] == "lever_arm.r_z"
     r_x = calibration.effects[1].parameters["r_x"]
-    assert r_x["unit"] == "m"
-    assert 0 < r_x["expanded_uncertainty"] < 0.002
+    assert r_x.unit == "m"
+    assert 0 < r_x.expanded_uncertainty < 0.002
     assert calibration.stages[-1].name == "effects"
     assert SensorCalibration.from_json("accelerometer", calibration.to_json()).effects == calibration.effects
 

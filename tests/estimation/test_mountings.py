@@ -14,7 +14,7 @@ from unit_settings import settings_of
 
 from pipeline.app.one_unit import unit_row
 from pipeline.checks.mounting import check_mounting
-from pipeline.core.records import FittedEffect, Noise, Recording, SensorCalibration, UnitRecordings
+from pipeline.core.records import Coefficient, FittedEffect, Noise, Recording, SensorCalibration, UnitRecordings
 from pipeline.estimation.effects import fit
 from pipeline.estimation.reference_least_squares import fit as fit_to_reference
 from pipeline.physics.effects import effect, effect_of
@@ -122,8 +122,8 @@ def test_the_tilt_that_looks_like_a_zero_of_one_shaft_does_not_widen_the_matrix(
         assert wider[3:12].max() < 1.1 * u[3:12].max()  # 100 times with that part of the tilt free
         assert np.abs(errors_over_u(tilted, seats)).max() < 4.0
         held_part, across = tilted.effects[-1].parameters.values()
-        assert (held_part["value"], held_part["expanded_uncertainty"]) == (0.0, None)
-        assert across["expanded_uncertainty"] > 1.9 * wider[-1] > 0.0 == wider[-2]
+        assert (held_part.value, held_part.expanded_uncertainty) == (0.0, None)
+        assert across.expanded_uncertainty > 1.9 * wider[-1] > 0.0 == wider[-2]
         assert tilted.stages[-1].parameters["table_tilt.d_x"].standard_uncertainty is None
         why = {line["source"]: line["reason"] for line in tilted.to_json()["uncertainty_budget"]["not_included"]}
         assert why["levelling"].startswith("table_tilt estimates the component across the shaft alone")
@@ -182,7 +182,7 @@ def test_columns_are_the_derivative_and_the_calibration_carries_the_recordings(n
     for j, step in enumerate(1e-4 * np.eye(len(values))):
         ahead, behind = (this.reading("accelerometer", motion, K["accelerometer"], values + s) for s in (step, -step))
         assert np.allclose(columns[:, :, j], (ahead - behind) / 2e-4, atol=1e-9)
-    parameters = {p.name: {"value": float(v)} for p, v in zip(this.parameters("accelerometer"), values, strict=True)}
+    parameters = {p.name: Coefficient(float(v)) for p, v in zip(this.parameters("accelerometer"), values, strict=True)}
     again = effect_of(FittedEffect(name, parameters, this.definition))
     assert np.array_equal(again.moved(motion, values).specific_force, this.moved(motion, values).specific_force)
     other = reference_motion(seated_anew(0, 1.0)[0][2])

@@ -57,7 +57,7 @@ def test_a_rate_that_is_not_logged_is_taken_from_the_angle_without_its_ramps() -
     recordings = [replace(r, table_rate=None) for r in bench.turns_at([60.0, -60.0])]
     found = calibrate("gyroscope", recordings)
     assert_exact(found, bench, 1e-4)
-    assert found.stages[0].details["samples_left_out"] > 0
+    assert found.stages[0].details.samples_left_out > 0
 
 
 def test_an_attitude_log_is_a_reference_too() -> None:
@@ -109,7 +109,7 @@ def test_only_settled_rests_count_where_the_table_stops_and_goes() -> None:
         recordings.append(replace(recording, accelerometer=disturbed))
     found = calibrate("accelerometer", recordings)
     assert_exact(found, bench)
-    assert found.stages[0].details["samples_left_out"] > 0
+    assert found.stages[0].details.samples_left_out > 0
 
 
 def test_clipped_and_stuck_samples_are_left_out_and_counted_but_gaps_are_not() -> None:
@@ -123,7 +123,7 @@ def test_clipped_and_stuck_samples_are_left_out_and_counted_but_gaps_are_not() -
         recordings.append(replace(recording, gyroscope=reading, flags=flags))
     found = calibrate("gyroscope", recordings)
     assert_exact(found, bench, 1e-9)
-    assert found.stages[0].details["samples_left_out"] == 3 * 8
+    assert found.stages[0].details.samples_left_out == 3 * 8
 
 
 def test_the_column_that_two_turns_of_a_gyroscope_leave_open_is_named() -> None:
@@ -171,7 +171,7 @@ def test_stated_uncertainty_covers_the_truth_under_bias_wander(wander: float, un
         u = np.sqrt(np.diag(found.covariance))
         hits.append(np.abs(error) <= coverage_factor(found.freedom) * u)
         details = found.stages[0].details
-        naive.append(np.abs(error[:3]) <= 1.96 * np.array(details["residual_rms"]) / np.sqrt(details["samples_used"]))
+        naive.append(np.abs(error[:3]) <= 1.96 * np.array(details.residual_rms) / np.sqrt(details.samples_used))
     assert 0.92 < np.mean(hits) < 0.985
     assert np.all(np.mean(hits, axis=0) > 0.95 - 4.0 * np.sqrt(0.0475 / units))
     assert np.mean(naive) < 0.7  # what sigma^2 (X^T X)^-1 would claim
@@ -180,8 +180,8 @@ def test_stated_uncertainty_covers_the_truth_under_bias_wander(wander: float, un
 def test_white_noise_is_told_from_bias_wander() -> None:
     bench = Bench(**ACCELEROMETER, white=8e-4, wander_size=5e-4, seed=4)
     details = calibrate("accelerometer", bench.stop_and_go(2.0, 1.2)).stages[0].details
-    assert details["white_noise"] == pytest.approx([8e-4] * 3, rel=0.2)
-    assert details["bias_wander"] == pytest.approx([5e-4] * 3, rel=0.5)
+    assert details.white_noise == pytest.approx([8e-4] * 3, rel=0.2)
+    assert details.bias_wander == pytest.approx([5e-4] * 3, rel=0.5)
 
 
 def test_a_long_static_recording_narrows_the_uncertainty_of_the_bias() -> None:

@@ -247,7 +247,7 @@ def test_clipped_and_stuck_samples_are_left_out() -> None:
     found = calibrate(recordings)
     assert np.allclose(found.bias, BIAS, atol=1e-10)
     clean = calibrate(Bench("accelerometer", BIAS, np.diag(1.0 / SCALE)).stop_and_go()).stages[-1].details
-    left_out = found.stages[-1].details["samples_left_out"] - clean["samples_left_out"]
+    left_out = found.stages[-1].details.samples_left_out - clean.samples_left_out
     assert 0 < left_out <= 180
 
 

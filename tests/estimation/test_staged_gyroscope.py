@@ -184,7 +184,7 @@ def test_a_stage_of_another_method_cannot_come_before() -> None:
 
 def test_ramps_are_no_part_of_a_steady_turn() -> None:
     rate = ramped_rate([60.0])
-    used = calibrate(Bench("gyroscope", BIAS, K).turns_at([60.0])).stages[0].details["samples_used"]
+    used = calibrate(Bench("gyroscope", BIAS, K).turns_at([60.0])).stages[0].details.samples_used
     steady_or_resting = int(np.sum((rate == 60.0) | (rate == 0.0)))
     assert 0.85 * 3 * steady_or_resting < used <= 3 * steady_or_resting
 

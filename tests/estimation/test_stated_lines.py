@@ -16,7 +16,7 @@ from pipeline.app.steps import batch
 from pipeline.app.steps.filter import filter_recordings
 from pipeline.app.steps.unit_files import FILES
 from pipeline.checks.reference_scale import rate_error
-from pipeline.core.records import FittedEffect, Noise, Note, UnitRecordings
+from pipeline.core.records import Coefficient, FittedEffect, Noise, Note, UnitRecordings
 from pipeline.core.settings import Settings
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.stated_lines import with_stated
@@ -109,7 +109,7 @@ def test_without_a_model_of_temperature_its_range_counts_with_the_data_sheets_li
 
 
 def test_with_a_fitted_effect_only_the_thermometer_counts_by_what_was_found(fitted: Any) -> None:
-    values = {f"b_T_{a}": {"value": v, "unit": "deg/s/degC"} for a, v in zip("xyz", (0.01, -0.02, 0.03), strict=True)}
+    values = {f"b_T_{a}": Coefficient(v, "deg/s/degC") for a, v in zip("xyz", (0.01, -0.02, 0.03), strict=True)}
     calibration, recordings = fitted
     size = 15
     covariance = np.zeros((size, size))

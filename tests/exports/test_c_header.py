@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline import load_calibration
-from pipeline.core.records import SENSORS, FittedEffect, SensorCalibration
+from pipeline.core.records import SENSORS, Coefficient, FittedEffect, SensorCalibration
 from pipeline.output.exports import ExportedUnit, export
 from pipeline.physics.compensation import SMOOTHING_S
 from pipeline.physics.effects import catalogue, effect, effect_from
@@ -93,10 +93,7 @@ def fitted(name: str, sensor: str, size: float, rng: np.random.Generator) -> Fit
     made = effect_from(OWN, "test") if name == "own" else effect(name)
     parameters = made.parameters(sensor)
     values = [100.0 if p.unit == "s" else size * rng.uniform(-1, 1) for p in parameters]
-    named = {
-        p.name: {"value": v, "unit": p.unit, "expanded_uncertainty": 0.0}
-        for p, v in zip(parameters, values, strict=True)
-    }
+    named = {p.name: Coefficient(v, p.unit, 0.0) for p, v in zip(parameters, values, strict=True)}
     return FittedEffect(name, named, made.definition)
 
 

@@ -14,7 +14,7 @@ from stage_files import export_all
 from unit_settings import settings_of
 
 from pipeline import load_calibration
-from pipeline.core.records import SENSORS, FittedEffect, SensorCalibration
+from pipeline.core.records import SENSORS, Coefficient, FittedEffect, SensorCalibration
 from pipeline.output.exports import Format, formats
 from pipeline.output.exports.reading import read_any
 
@@ -30,7 +30,7 @@ SETTINGS = settings_of(sensor={s: SHEET | {"counts_per_unit": COUNTS[s]} for s i
 
 
 def effect(name: str, **values: float) -> FittedEffect:
-    return FittedEffect(name, {k: {"value": v, "unit": "", "expanded_uncertainty": 0.0} for k, v in values.items()})
+    return FittedEffect(name, {k: Coefficient(v, "", 0.0) for k, v in values.items()})
 
 
 SENSITIVE = effect(

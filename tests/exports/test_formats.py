@@ -14,7 +14,7 @@ from stage_files import export_all
 
 from pipeline.app.commands.convert import main as convert
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.records import FittedEffect, SensorCalibration
+from pipeline.core.records import Coefficient, FittedEffect, SensorCalibration
 from pipeline.core.settings import Settings
 from pipeline.output import exports
 from pipeline.output.exports import formats
@@ -37,7 +37,7 @@ GYROSCOPE = np.array([[1.017, 0.016, -0.019], [-0.013, 1.001, -0.005], [0.014, 0
 def fitted(name: str, sensor: str, size: float, rng: np.random.Generator) -> FittedEffect:
     values = size * rng.uniform(-1, 1, len(effect(name).parameters(sensor)))
     named = zip(effect(name).parameters(sensor), values, strict=True)
-    return FittedEffect(name, {p.name: {"value": v, "unit": p.unit, "expanded_uncertainty": 0.0} for p, v in named})
+    return FittedEffect(name, {p.name: Coefficient(v, p.unit, 0.0) for p, v in named})
 
 
 def document(effects: dict[str, dict[str, float]], seed: int = 3) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from stage_files import export_all
 from unit_settings import settings_of
 
 from pipeline import load_calibration
-from pipeline.core.records import FittedEffect, SensorCalibration
+from pipeline.core.records import Coefficient, FittedEffect, SensorCalibration
 from pipeline.output.exports.sensors import ExportedSensor
 
 G0 = 9.80665
@@ -28,7 +28,7 @@ SETTINGS = settings_of(sensor={s: SHEET | {"counts_per_unit": 16384.0} for s in 
 def document(*, sensitive: bool = False) -> dict[str, Any]:
     names = [f"G_{a}{b}" for a in "xyz" for b in "xyz"]
     named = zip(names, SENSITIVITY.ravel(), strict=True)
-    g_sensitivity = FittedEffect("g_sensitivity", {n: {"value": float(v), "unit": "deg/s/g"} for n, v in named})
+    g_sensitivity = FittedEffect("g_sensitivity", {n: Coefficient(float(v), "deg/s/g") for n, v in named})
     out: dict[str, Any] = {"unit": "U1\nreboot", "schema_version": 1, "status": "ok", "sensor": "mpu6050", "inputs": []}
     for sensor, bias in BIAS.items():
         effects = (g_sensitivity,) if sensitive and sensor == "gyroscope" else ()

@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from pipeline.app.steps.calibration import calibrated_range, judged
-from pipeline.core.records import FittedEffect, Recording, SensorCalibration
+from pipeline.core.records import Coefficient, FittedEffect, Recording, SensorCalibration
 from pipeline.ingest.quality_flags import CLIPPED
 from pipeline.physics.calibration_file import sample_covariance
 from pipeline.physics.statements import implausible, sentences
@@ -27,10 +27,7 @@ def sheet(model: str, sensor: str) -> DataSheet:
 
 
 def marked(model: str, sensor: str, K: np.ndarray, bias: float = 0.0, sigma: float = 1e-4, **effects: float) -> Any:
-    fitted = tuple(
-        FittedEffect(n, {f"K2_{a}": {"value": v, "unit": "1/g", "expanded_uncertainty": 0.0} for a in "xyz"})
-        for n, v in effects.items()
-    )
+    fitted = tuple(FittedEffect(n, {f"K2_{a}": Coefficient(v, "1/g", 0.0) for a in "xyz"}) for n, v in effects.items())
     covariance = sigma**2 * np.eye(12 + 3 * len(fitted))
     part = SensorCalibration(sensor, np.full(3, bias), np.linalg.inv(K), effects=fitted, covariance=covariance)
     return implausible(sensor, part.to_json(), sheet(model, sensor))
@@ -94,7 +91,7 @@ def test_one_axis_a_bias_a_cross_axis_term_and_an_effect_are_named() -> None:
 
 def test_what_is_not_known_well_enough_is_not_marked() -> None:
     assert marked("mpu6050", "accelerometer", np.eye(3), 0.5, sigma=0.1) == []
-    fitted = FittedEffect("quadratic_nonlinearity", {f"K2_{a}": {"value": 0.5, "unit": "1/g"} for a in "xyz"})
+    fitted = FittedEffect("quadratic_nonlinearity", {f"K2_{a}": Coefficient(0.5, "1/g") for a in "xyz"})
     part = SensorCalibration("accelerometer", effects=(fitted,)).to_json()
     assert implausible("accelerometer", part, sheet("mpu6050", "accelerometer")) == []
 

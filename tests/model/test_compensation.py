@@ -10,7 +10,7 @@ import pytest
 
 import pipeline
 from pipeline.core.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError, PipelineError
-from pipeline.core.records import SENSORS, FittedEffect, Motion, SensorCalibration
+from pipeline.core.records import SENSORS, Coefficient, FittedEffect, Motion, SensorCalibration
 from pipeline.physics.compensation import BLOCK, Compensation, load
 from pipeline.physics.effects import catalogue, effect_from
 from pipeline.physics.effects.base import Owner
@@ -49,7 +49,7 @@ def fitted(name: str, sensor: str, seed: int = 1) -> FittedEffect:
     most = 0.1 * np.max(np.abs(truth(sensor, m))) / np.max(np.abs(columns), axis=(0, 1), initial=1e-300)
     for p, limit in zip(this.parameters(sensor), most, strict=True):
         value = 120.0 if p.unit == "s" else rng.uniform(-1, 1) * min(SIZE[sensor], limit)
-        parameters[p.name] = {"value": value, "unit": p.unit, "expanded_uncertainty": 0.0}
+        parameters[p.name] = Coefficient(value, p.unit, 0.0)
     return FittedEffect(name, parameters)
 
 
@@ -117,7 +117,7 @@ def own_effect(sensor: str) -> FittedEffect:
     made = effect_from(definition, "test")
     names = [p.name for p in made.parameters(sensor)]
     values = np.random.default_rng(5).uniform(-1e-3, 1e-3, len(names))
-    parameters = {n: {"value": v, "unit": "1", "expanded_uncertainty": 0.0} for n, v in zip(names, values, strict=True)}
+    parameters = {n: Coefficient(v, "1", 0.0) for n, v in zip(names, values, strict=True)}
     return FittedEffect("own", parameters, made.definition)
 
 
@@ -132,10 +132,9 @@ def some_steady_some_moving() -> dict[str, SensorCalibration]:
 def one_after_the_other() -> dict[str, SensorCalibration]:
     """A gyroscope that is solved by fixed point, and an accelerometer that looks at what it has found."""
     cubic = fitted("cubic_nonlinearity", "gyroscope")  # as strong as makes the number of rounds vary
-    parameters = {name: {**p, "value": 2e-6} for name, p in cubic.parameters.items()}
     return {
         "accelerometer": calibration("accelerometer", (fitted("inner_lever_arms", "accelerometer"),)),
-        "gyroscope": calibration("gyroscope", (FittedEffect(cubic.name, parameters),)),
+        "gyroscope": calibration("gyroscope", (cubic.at([2e-6] * len(cubic.parameters)),)),
     }
 
 
@@ -224,9 +223,7 @@ def test_a_missing_reading_stays_missing_and_alone() -> None:
 
 def test_temperature_noise_does_not_reach_the_reading() -> None:
     m = motion(3000, dt=0.12)
-    effect = FittedEffect("bias_temperature", fitted("bias_temperature", "gyroscope").parameters)
-    for p in effect.parameters.values():
-        p["value"] = 0.16
+    effect = fitted("bias_temperature", "gyroscope").at([0.16] * 3)
     c = calibration("gyroscope", (effect,))
     noisy = m.temperature + 0.05 * np.random.default_rng(0).standard_normal(3000)
     reading = predicted_reading(c, m)
@@ -284,8 +281,7 @@ def test_shapes_that_do_not_match_are_refused() -> None:
 
 def test_a_reading_far_out_of_range_is_named() -> None:
     effect = fitted("cubic_nonlinearity", "accelerometer")
-    for p in effect.parameters.values():
-        p["value"] = 5e-3
+    effect = effect.at([5e-3] * len(effect.parameters))
     reading = np.zeros((5, 3))
     reading[3, 1] = 400.0
     with pytest.raises(ConvergenceError, match=r"reading of 400 \(sample 4"):
@@ -293,7 +289,7 @@ def test_a_reading_far_out_of_range_is_named() -> None:
 
 
 def test_an_effect_without_an_implementation_is_named() -> None:
-    strange = FittedEffect("phase_of_the_moon", {"a": {"value": 1.0, "unit": "1", "expanded_uncertainty": 0.0}})
+    strange = FittedEffect("phase_of_the_moon", {"a": Coefficient(1.0, "1", 0.0)})
     with pytest.raises(ConfigurationError, match="phase_of_the_moon"):
         Compensation(calibration("accelerometer", (strange,)), None).apply(np.zeros((1, 3)))
 
@@ -409,7 +405,7 @@ FAULTS: list[Change] = [
 
 @pytest.mark.parametrize(("old", "new", "message"), FAULTS)
 def test_a_fault_in_a_calibration_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
-    entries = {f"G_{a}{b}": {"value": 0.05, "unit": "deg/s/g"} for a in "xyz" for b in "xyz"}
+    entries = {f"G_{a}{b}": Coefficient(0.05, "deg/s/g") for a in "xyz" for b in "xyz"}
     part = SensorCalibration("gyroscope", effects=(FittedEffect("g_sensitivity", entries),)).to_json()
     head = {"schema_version": 1, "unit": "U1", "status": "ok", "error": None}
     text = json.dumps({**head, "accelerometer": None, "gyroscope": part})

@@ -10,7 +10,7 @@ from bench_session import K, Session, record
 from scipy.spatial.transform import Rotation
 
 from pipeline.core.errors import ConfigurationError, InputError
-from pipeline.core.records import FittedEffect, Motion, Recording, SensorCalibration
+from pipeline.core.records import Coefficient, FittedEffect, Motion, Recording, SensorCalibration
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import parameter_limits, turning_direction
 from pipeline.physics.kinematics import reference_motion
@@ -149,7 +149,7 @@ def test_timing_moves_the_motion_that_other_effects_see() -> None:
         FittedEffect(
             n,
             {
-                p.name: {"value": v, "unit": p.unit, "expanded_uncertainty": 0.0}
+                p.name: Coefficient(v, p.unit, 0.0)
                 for p, v in zip(effect(n).parameters("accelerometer"), values, strict=True)
             },
         )

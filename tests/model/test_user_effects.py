@@ -17,7 +17,7 @@ from unit_settings import settings_of
 
 from pipeline import load_calibration
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.core.records import FittedEffect, Motion, Recording, SensorCalibration
+from pipeline.core.records import Coefficient, FittedEffect, Motion, Recording, SensorCalibration
 from pipeline.core.settings import UserEffectFiles
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.physics.effects import (
@@ -261,9 +261,7 @@ def test_registered_effects_stand_beside_the_built_in_ones_and_never_for_one() -
 
 def calibration(definition: dict[str, Any]) -> SensorCalibration:
     values = {"d_x": 0.01, "d_y": -0.02, "d_z": 0.015}
-    fitted = FittedEffect(
-        "loose_part", {n: {"value": v, "unit": "", "expanded_uncertainty": 0.0} for n, v in values.items()}, definition
-    )
+    fitted = FittedEffect("loose_part", {n: Coefficient(v, "", 0.0) for n, v in values.items()}, definition)
     matrix = np.linalg.inv(K["accelerometer"])
     return SensorCalibration("accelerometer", np.array([0.1, 0.2, -0.1]), matrix, effects=(fitted,))
 

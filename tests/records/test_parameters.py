@@ -16,6 +16,7 @@ from pipeline.core.records import (
     BIAS,
     MATRIX,
     MATRIX_ROWS,
+    Coefficient,
     FittedEffect,
     SensorCalibration,
     base_values,
@@ -23,8 +24,8 @@ from pipeline.core.records import (
 )
 
 EFFECTS = (
-    FittedEffect("bias_temperature", {f"c_{a}": {"value": float(k), "unit": "g/degC"} for k, a in enumerate("xyz")}),
-    FittedEffect("lever_arm", {f"r_{a}": {"value": 10.0 + k, "unit": "m"} for k, a in enumerate("xyz")}),
+    FittedEffect("bias_temperature", {f"c_{a}": Coefficient(float(k), "g/degC") for k, a in enumerate("xyz")}),
+    FittedEffect("lever_arm", {f"r_{a}": Coefficient(10.0 + k, "m") for k, a in enumerate("xyz")}),
 )
 
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from pipeline.core.records import SensorCalibration
-from pipeline.estimation.engine import convergence_evidence
+from pipeline.core.records import Convergence, SensorCalibration
 from pipeline.estimation.table_errors import type_b
 from pipeline.estimation.uncertainty_budget import combined, scatter_contribution
 from pipeline.output.pages.pages import template
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def with_budget(**changes: Any) -> dict[str, Any]:
-    plain = SensorCalibration("gyroscope", convergence=convergence_evidence(3e-12, 1.75, 12, 12))
+    plain = SensorCalibration("gyroscope", convergence=Convergence(3e-12, 1.75, 12, 12))
     effect = np.zeros((12, 2))
     effect[3, 0], effect[7, 1] = 1.0, 1.0
     lines = [scatter_contribution(1e-8 * np.eye(12), 5.0), type_b("table rate", "normal", 3e-4, "1", effect)]

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.core.records import Budget, Contribution, FittedEffect, SensorCalibration
+from pipeline.core.records import Budget, Coefficient, Contribution, FittedEffect, NoiseParts, SensorCalibration
 from pipeline.output.pages.combined import calibration_with_prior, estimates, priors_of
 
 TRUTH = np.concatenate([[0.02, -0.01, 0.03], np.eye(3).ravel()])
 OWN_U, BENCH_U, TAU = 1e-4, 3e-4, 1e-4
 SENSOR = "accelerometer"
 EFFECTS = (
-    FittedEffect("bias_temperature", {"c_x": {"value": 1e-4, "unit": "g/degC"}}),
-    FittedEffect("table_tilt", {"d_x": {"value": 0.01, "unit": "deg"}}),
+    FittedEffect("bias_temperature", {"c_x": Coefficient(1e-4, "g/degC")}),
+    FittedEffect("table_tilt", {"d_x": Coefficient(0.01, "deg")}),
 )
 
 
@@ -37,14 +37,12 @@ def document(
             "Student's t",
             own,
             np.full(size, 50.0),
-            parts={"lack of fit": np.full(size, lack * OWN_U)},
+            parts=NoiseParts(lack_of_fit=np.full(size, lack * OWN_U)),
         ),
         Contribution("local gravity", "B", "normal", bench, np.full(size, np.inf)),
     ]
     given = zip(effects, values[12:], strict=True)
-    fitted = tuple(
-        FittedEffect(e.name, {n: {**p, "value": v} for n, p in e.parameters.items()}, e.definition) for e, v in given
-    )
+    fitted = tuple(e.at([v] * len(e.parameters)) for e, v in given)
     found = SensorCalibration(
         SENSOR, values[:3], values[3:12].reshape(3, 3), effects=fitted, covariance=own + bench,
         freedom=np.where(estimated, 50.0 * 10.0**2, np.inf), degrees_of_freedom=5000.0,

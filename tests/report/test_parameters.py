@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import polar
 from unit_settings import sheet_of
 
-from pipeline.core.records import FittedEffect, SensorCalibration
+from pipeline.core.records import Coefficient, FittedEffect, SensorCalibration
 from pipeline.output.pages.comparison import unit_figures
 from pipeline.output.pages.parameters import fitted_parameters, parameter_rows, reading_errors, sensor_errors
 from pipeline.physics.statements import beyond_limits, beyond_words
@@ -15,7 +15,7 @@ def part_with_unequal_freedom() -> dict:
     """Return a fit whose bias has 4 and whose effect has 400 effective degrees of freedom."""
     freedom = np.array([4.0] * 3 + [400.0] * 10)
     k = {4.0: 2.776445, 400.0: 1.965912}  # Student's t, 95 %, of published tables
-    effect = FittedEffect("scale_factor_asymmetry", {"c_x": {"value": 0.01, "unit": "1", "expanded_uncertainty": 0.0}})
+    effect = FittedEffect("scale_factor_asymmetry", {"c_x": Coefficient(0.01, "1", 0.0)})
     covariance = np.diag(np.full(13, 1e-6))
     fit = SensorCalibration("gyroscope", effects=(effect,), covariance=covariance, freedom=freedom)
     budget = {
@@ -63,8 +63,8 @@ def test_the_uncertainty_of_the_inverse_is_that_of_drawn_matrices() -> None:
 def test_a_parameter_far_to_either_side_is_beyond_its_limit_and_the_position_of_the_unit_is_not(sign: float) -> None:
     turned = np.array([[np.cos(0.1), -np.sin(0.1), 0.0], [np.sin(0.1), np.cos(0.1), 0.0], [0.0, 0.0, 1.0]])
     K = (np.eye(3) + sign * np.diag([0.06, 0.0, 0.0])) @ turned
-    time_constant = {"T": {"value": 500.0, "unit": "s", "expanded_uncertainty": None}}
-    bias = {f"b_{a}": {"value": 0.1, "unit": "deg/s", "expanded_uncertainty": 0.01} for a in "xyz"}
+    time_constant = {"T": Coefficient(500.0, "s", None)}
+    bias = {f"b_{a}": Coefficient(0.1, "deg/s", 0.01) for a in "xyz"}
     warm_up = FittedEffect("warm_up", {**bias, **time_constant})
     matrix, covariance = np.linalg.inv(K), np.eye(16)
     fit = SensorCalibration("gyroscope", np.array([0.0, sign * 5.0, 0.0]), matrix, (), (warm_up,), covariance)

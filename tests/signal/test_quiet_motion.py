@@ -57,8 +57,8 @@ def test_a_creeping_unit_has_the_floor_and_the_errors_of_one_that_stands_still()
         low, high = part["expected_rms_error"]
         assert low < part["steps"][-1]["rms_error"] < high
         figures[creep] = [part["noise_floor"], part["steps"][-1]["rms_error"], float(noise.white.mean())]
-        rests = found.stages[-1].details["rests_used"]
-        assert sum(rest["creep_dps"] > 0.0 for rest in rests) == (len(rests) if creep else 0)
+        rests = found.stages[-1].details.rests_used
+        assert sum(rest.creep_dps > 0.0 for rest in rests) == (len(rests) if creep else 0)
     assert figures[0.15][0] < 1.5 * figures[0.0][0]
     assert figures[0.15][1] < 1.5 * figures[0.0][1]
     assert figures[0.15][2] == pytest.approx(figures[0.0][2], rel=0.03)

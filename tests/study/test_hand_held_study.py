@@ -176,4 +176,4 @@ def test_the_cosine_is_zero_under_the_weights_of_the_fit() -> None:
     drawn = draw(Hand(settle_deg=0.3, creep_dps=0.1), 1)
     found = rests_and_moves.fit(with_noise([drawn.recording], drawn.settings), None, drawn.settings)
     assert found.convergence is not None
-    assert found.convergence["cosine"] < found.convergence["cosine_at_minimum"] < 1e-3  # other weights give 1.5e-3
+    assert found.convergence.cosine < found.convergence.cosine_at_minimum < 1e-3  # other weights give 1.5e-3

@@ -9,7 +9,16 @@ import pytest
 from scipy.signal import lfilter
 from unit_settings import filter_of, settings_of
 
-from pipeline.core.records import FittedEffect, Multiply, Noise, Recording, SensorCalibration, StageResult, Subtract
+from pipeline.core.records import (
+    Coefficient,
+    FittedEffect,
+    Multiply,
+    Noise,
+    Recording,
+    SensorCalibration,
+    StageResult,
+    Subtract,
+)
 from pipeline.physics.effects import effect
 from pipeline.physics.kinematics import earth_rate, reference_motion
 from pipeline.physics.measurement import compensate, predicted_reading
@@ -58,10 +67,7 @@ def calibration(sensor: str, *effects: FittedEffect) -> SensorCalibration:
 
 def fitted(name: str, sensor: str, size: float) -> FittedEffect:
     rng = np.random.default_rng(1)
-    values = {
-        p.name: {"value": size * rng.uniform(0.5, 1.0), "unit": p.unit, "expanded_uncertainty": 0.0}
-        for p in effect(name).parameters(sensor)
-    }
+    values = {p.name: Coefficient(size * rng.uniform(0.5, 1.0), p.unit, 0.0) for p in effect(name).parameters(sensor)}
     return FittedEffect(name, values)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.core.records import FittedEffect, SensorCalibration
+from pipeline.core.records import Coefficient, FittedEffect, SensorCalibration
 from pipeline.evaluation.held_out.heldout import residuals_over_temperature
 from pipeline.evaluation.held_out.samples import Samples
 
@@ -32,7 +32,7 @@ def test_a_slope_that_is_not_modelled_is_the_mean_residual_of_the_bins() -> None
 
 def test_a_slope_that_is_modelled_leaves_noise() -> None:
     values = {"b_T_x": 0.0, "b_T_y": 0.0, "b_T_z": SLOPE}
-    effect = FittedEffect("bias_temperature", {k: {"value": v, "unit": "g/degC"} for k, v in values.items()})
+    effect = FittedEffect("bias_temperature", {k: Coefficient(v, "g/degC") for k, v in values.items()})
     found = residuals_over_temperature(SensorCalibration("accelerometer", effects=(effect,)), [samples(10, 40)])
     assert found is not None
     assert max(abs(b.mean_error) for b in found) < 5e-5

@@ -163,7 +163,7 @@ def test_ten_rests_without_a_recording_for_validation_calibrate_both_sensors() -
     recordings = read_recordings(config.procedure, config.ingest, config.sensor, campaign.folder("mpu6050"))
     alone = [r for r in recordings if r.role != "validation"]
     found = rests_and_moves.fit(with_noise(alone, config), None, config)
-    assert found.stages[-1].details["rests"] == 10
+    assert found.stages[-1].details.rests == 10
     assert np.abs(np.diag(found.matrix) / AUTHORS["gyroscope"] - 1)[1:].max() < 9e-4
     part = validate(found, alone, estimate_noise("gyroscope", alone, config.sensor.gyroscope), config)
     assert not part["held_out"]

@@ -362,7 +362,7 @@ def _with_known(method: Method, sensors: Sensor) -> Method:
         except ConfigurationError as error:
             raise SettingProblem(f"method.{sensor}={method.of(sensor)}: {error.message}") from None
         if effects:
-            known[sensor] = [{"name": e.name, "parameters": e.parameters} for e in effects]
+            known[sensor] = [e.to_json() for e in effects]
     return method.replaced(known=known) if known else method
 
 

@@ -52,7 +52,7 @@ import numpy as np
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import AXES, BIAS, NotCalibrated, Recording, SensorCalibration, Values, coverage_factor
 from pipeline.estimation.accelerometer.nonlinear_least_squares import IDEAL, LOWER_COLUMNS, LOWER_ROWS, PLACE, triangle
-from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, limit_of_misalignment
+from pipeline.estimation.multi_position.accelerometer import limit_of_misalignment
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
 from pipeline.estimation.multi_position.moves import sound_span
 from pipeline.estimation.rest_means import ROLE, Orientations, holdout_interval, orientations_of, rest_means
@@ -181,7 +181,7 @@ def progress_of(unit: UnitState, settings: Settings, dwell: float) -> GuideProgr
     values, scatter, reason = IDEAL, 0.0, fit.reason if isinstance(fit, NotCalibrated) else _undetermined(fit)
     if fitted is not None:
         values = fitted.parameters.values[PLACE]
-        scatter = float(fitted.stages[-1].details["scatter_between_rests"])
+        scatter = fitted.stages[-1].details.scatter_between_rests or 0.0
     data_sheet, gravity = settings.sensor.accelerometer, settings.table.gravity_g
     rests, white = orientations.rests, _white_of_rest(orientations, data_sheet, dwell)
     error = float(np.hypot(white, scatter))
@@ -195,7 +195,7 @@ def progress_of(unit: UnitState, settings: Settings, dwell: float) -> GuideProgr
     if fitted is not None:
         nine = fitted.parameters.select(PLACE)
         covariance = nine.covariance
-        if fitted.stages[-1].details[KNOWN_BY_LIMIT]:
+        if fitted.stages[-1].details.known_by_limit:
             F = np.asarray(np.linalg.inv(covariance), np.float64)
         else:
             freedom, inflation = nine.degrees_of_freedom, np.diag(covariance) / np.diag(np.linalg.inv(F))
@@ -248,8 +248,8 @@ def derivative_of(y: Values, values: Values) -> Values:
 
 def _undetermined(fitted: SensorCalibration) -> str:
     """Return what the rests do not determine; empty if they determine everything."""
-    by_limit = fitted.stages[-1].details[KNOWN_BY_LIMIT]
-    count = fitted.stages[-1].details["orientations_used"]
+    details = fitted.stages[-1].details
+    by_limit, count = details.known_by_limit, details.orientations_used or 0
     if by_limit:
         return f"{count} orientations leave {', '.join(by_limit)} open"
     return f"{count} orientations determine nine parameters without a check" if count <= MIN_RESTS else ""

@@ -16,7 +16,7 @@ import numpy as np
 from imu_logs.units import AXES, SENSOR_UNITS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import ArrayLike
 
@@ -127,8 +127,37 @@ class Parameters:
 
 NORMAL, RECTANGULAR = "normal", "rectangular"
 LIMIT = "not determined by the recordings: limit of the sensor file"  # a source of the uncertainty budget
-TURN_AXES = "turn_axes"  # in the details of a stage: how well the axes of turns by hand are known, and would need to be
+LACK_OF_FIT = "lack of fit"  # a part of the noise of the readings
+PART_NAMES = {
+    "white": "white noise",
+    "wander": "bias wander",
+    "lack_of_fit": LACK_OF_FIT,
+    "wander_and_scatter": "bias wander and scatter of the rests",
+}
 MONTE_CARLO = "monte_carlo"  # key of the run in a published budget
+
+
+@dataclass(frozen=True)
+class NoiseParts:
+    """The known parts of the noise of the readings: (p,) standard uncertainties; None: not separate."""
+
+    white: Values | None = None
+    wander: Values | None = None
+    lack_of_fit: Values | None = None  # that noise does not explain: 0 in a correct model
+    wander_and_scatter: Values | None = None  # of rests by hand
+
+    def mapped(self, change: Callable[[Values], Values]) -> NoiseParts:
+        """Return the parts with each changed by a function."""
+        return NoiseParts(**{name: values if values is None else change(values) for name, values in vars(self).items()})
+
+    def to_json(self) -> dict[str, list[float]]:
+        """Return the entry of the document."""
+        return {PART_NAMES[name]: values.tolist() for name, values in vars(self).items() if values is not None}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, list[float]]) -> Self:
+        """Return the object from the value of ``to_json``."""
+        return cls(**{part: np.array(data[name], float) for part, name in PART_NAMES.items() if name in data})
 
 
 @dataclass(frozen=True)
@@ -143,7 +172,7 @@ class BudgetLine:
     input_uncertainty: float | None = None  # standard uncertainty; None if the source is not a single quantity
     input_unit: str = ""
     independent: int = 1  # number of independent quantities with this uncertainty (stops of a table, axes)
-    parts: Mapping[str, Values] = field(default_factory=dict)  # known components, (p,) standard uncertainties
+    parts: NoiseParts = NoiseParts()
     remark: str = ""
 
     def at(self, rows: Sequence[int | None]) -> BudgetLine:
@@ -152,7 +181,7 @@ class BudgetLine:
             self,
             standard_uncertainty=_at(self.standard_uncertainty, rows),
             degrees_of_freedom=_at(self.degrees_of_freedom, rows, np.inf),
-            parts={name: _at(values, rows) for name, values in self.parts.items()},
+            parts=self.parts.mapped(lambda values: _at(values, rows)),
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -168,7 +197,7 @@ class BudgetLine:
             "sensitivity": (contribution / u).tolist() if u else None,
             "contribution": contribution.tolist(),
             "degrees_of_freedom": finite(self.degrees_of_freedom),
-            "parts": {name: values.tolist() for name, values in self.parts.items()},
+            "parts": self.parts.to_json(),
             "remark": self.remark,
         }
 
@@ -184,7 +213,7 @@ class BudgetLine:
             data["standard_uncertainty"],
             data["unit"],
             data["independent_inputs"],
-            {name: np.array(values, float) for name, values in data["parts"].items()},
+            NoiseParts.from_json(data["parts"]),
             data["remark"],
         )
 
@@ -201,7 +230,7 @@ class Contribution:
     input_uncertainty: float | None = None
     input_unit: str = ""
     independent: int = 1
-    parts: Mapping[str, Values] = field(default_factory=dict)
+    parts: NoiseParts = NoiseParts()
     remark: str = ""
 
     @property
@@ -211,7 +240,7 @@ class Contribution:
 
     def of(self, selected: slice) -> Contribution:
         """Return the contribution to the selected parameters."""
-        parts = {name: values[selected] for name, values in self.parts.items()}
+        parts = self.parts.mapped(lambda values: values[selected])
         freedom = self.degrees_of_freedom[selected]
         return replace(self, covariance=self.covariance[selected, selected], degrees_of_freedom=freedom, parts=parts)
 

@@ -16,7 +16,8 @@ where b, p, n, s are (3,) and M is (3, 3).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
@@ -41,7 +42,7 @@ from pipeline.core.records.budget import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable
 
     from numpy.typing import NDArray
 
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 
 
 STEP_KINDS = "subtract, matrix, two_sided"
+COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, times a factor for sums over many residuals
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,142 @@ PRODUCT = 0.1  # of a limit: the largest change of one parameter by the limit of
 READABLE_VERSIONS = (1, 2)  # a key that a document of version 1 lacks counts as null
 
 
+@dataclass(frozen=True, kw_only=True)
+class RestUse:
+    """A rest that a fit uses, holds out or leaves out."""
+
+    recording: str
+    time_s: float
+    duration_s: float
+    creep_dps: float = 0.0  # where it is significant
+    reason: str = ""  # why it is refused
+
+
+@dataclass(frozen=True)
+class OutlyingMove:
+    """A move by hand that has less weight in a fit."""
+
+    recording: str
+    time_s: float
+    error_deg: float
+    over_noise: float
+    weight: float
+
+
+@dataclass(frozen=True)
+class TurnAngle:
+    """The total angle of a turn: stated, and by the calibration."""
+
+    recording: str
+    time_s: float
+    axis: str
+    stated_deg: float
+    angle_deg: float
+
+
+@dataclass(frozen=True)
+class TurnAxes:
+    """How well the axes of turns by hand are known, and would need to be."""
+
+    stated_deg: float
+    needed_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageDetails:
+    """What a stage states of its fit, for the report and for later stages; None: it does not state this.
+
+    Of noise, a number is that of all channels. A new stage mostly needs the first block.
+    """
+
+    rests: int | None = None
+    samples_used: int | None = None
+    samples_left_out: int | None = None
+    equations: int | None = None
+    rounds: int | None = None  # iterations
+    condition: float | None = None  # of the scaled columns; infinite is published as null
+    cosine: float | None = None  # largest between the residual and a column
+    degrees_of_freedom: float | None = None  # smallest of all parameters
+    white_noise: float | Sequence[float] | None = None
+    bias_wander: Sequence[float] | None = None
+    residual_rms: Sequence[float] | None = None  # of each channel
+    departures: Sequence[str] | None = None  # of faces and turns by hand from what is stated
+    replaces: str | None = None  # stage whose bias and matrix are fitted anew
+    # a fit with effects
+    samples: int | None = None
+    wander_ratio: float | None = None
+    wander_time_s: float | None = None
+    scatter_over_noise: Sequence[float] | None = None
+    # rests and moves by hand
+    orientations_used: int | None = None
+    rests_used: Sequence[RestUse] | None = None
+    rests_left_out: Sequence[RestUse] | None = None
+    rests_held_out: Sequence[RestUse] | None = None
+    known_by_limit: Mapping[str, float] | None = None  # parameters with a pseudo-observation, each with its u
+    scatter_between_rests: float | None = None
+    largest_error: float | None = None
+    rests_on_faces: Mapping[str, int] | None = None
+    face_off_deg: Mapping[str, float] | None = None
+    moves: int | None = None
+    direction_error_rms_deg: float | None = None  # null without a move, as the scatter of moves
+    scatter_of_rests: float | None = None
+    scatter_of_moves: float | None = None
+    scatter_of_directions: float | None = None
+    moves_weighted_down: int | None = None
+    moves_outlying: Sequence[OutlyingMove] | None = None
+    accelerometer_moved: Sequence[float] | None = None  # change of its bias and matrix that the moves show
+    # turns
+    turns: int | Sequence[TurnAngle] | None = None
+    turns_left_out: int | None = None
+    turn_axes: TurnAxes | None = None
+    angle_error_rms_deg: Sequence[Sequence[float | None]] | None = None
+    orthonormality_error: float | None = None
+    determinant_of_M: float | None = None  # noqa: N815  (the key of the document)
+    # a given calibration, the mean of several, or one with the prior of its lot
+    source: str | None = None
+    sha256: str | None = None
+    notes: Sequence[str] | None = None
+    left_out: Sequence[str] | None = None
+    calibrations: int | None = None
+    repeatability: Sequence[float] | None = None
+    lot: str | None = None
+    siblings: int | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entries of the document."""
+        without_moves = ("direction_error_rms_deg", "scatter_of_moves") if self.moves is not None else ()
+        stated = {k: _plain(v) for k, v in vars(self).items() if v is not None or k in without_moves}
+        return stated if self.condition is None or np.isfinite(self.condition) else {**stated, "condition": None}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Return the object from the value of ``to_json``."""
+        known = {k: v for k, v in data.items() if k in cls.__dataclass_fields__}  # not of other versions
+        if "condition" in known and known["condition"] is None:
+            known["condition"] = float("inf")
+        for name, kind in ENTRIES.items():
+            if isinstance(entries := known.get(name), list):
+                known[name] = tuple(kind(**entry) for entry in entries)
+        if axes := known.get("turn_axes"):
+            known["turn_axes"] = TurnAxes(**axes)
+        return cls(**known)
+
+
+ENTRIES = {
+    **dict.fromkeys(("rests_used", "rests_left_out", "rests_held_out"), RestUse),
+    "moves_outlying": OutlyingMove, "turns": TurnAngle,
+}  # fmt: skip
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401  (a JSON value)
+    """Return a value of ``StageDetails`` as JSON."""
+    if isinstance(value, RestUse | OutlyingMove | TurnAngle | TurnAxes):
+        return dict(vars(value))
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(each) for each in value]
+    return dict(value) if isinstance(value, Mapping) else value
+
+
 @dataclass(frozen=True)
 class StageResult:
     """One stage of a fit."""
@@ -146,46 +284,92 @@ class StageResult:
     correction: tuple[CorrectionStep, ...] | None = (
         None  # of readings after this stage, if it is more than matrix and bias
     )
-    details: Mapping[str, Any] = field(default_factory=dict)  # for the report: condition number, samples, iterations
+    details: StageDetails = field(default_factory=StageDetails)
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of the document."""
         parameters = {name: dict(vars(estimate)) for name, estimate in self.parameters.items()}
         correction = None if self.correction is None else published(self.correction)
-        return {**vars(self), "parameters": parameters, "correction": correction}
+        return {**vars(self), "parameters": parameters, "correction": correction, "details": self.details.to_json()}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
         """Return the object from the value of ``to_json``."""
         parameters = {name: Estimate(**estimate) for name, estimate in data["parameters"].items()}
-        return cls(**{**data, "parameters": parameters, "correction": steps_of(data.get("correction"))})
+        correction, details = steps_of(data.get("correction")), StageDetails.from_json(data.get("details") or {})
+        return cls(data["name"], parameters, data.get("residual_rms"), correction, details)
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """The value of a coefficient of an effect."""
+
+    value: float
+    unit: str = ""  # empty: not stated
+    expanded_uncertainty: float | None = None
 
 
 @dataclass(frozen=True)
 class FittedEffect:
-    """A fitted effect; ``parameters`` map names to ``{"value", "unit", "expanded_uncertainty"}``.
+    """A fitted effect.
 
     ``definition`` is the content of the file of a user's effect, so that the calibration can be applied without that
     file; None for a built-in effect.
     """
 
     name: str
-    parameters: dict[str, dict[str, Any]]
+    parameters: Mapping[str, Coefficient]
     definition: dict[str, Any] | None = None
 
     @property
     def values(self) -> Values:
         """Values of the parameters, in their order."""
-        return np.array([p["value"] for p in self.parameters.values()])
+        return np.array([p.value for p in self.parameters.values()])
+
+    def at(self, values: Iterable[float]) -> FittedEffect:
+        """Return the effect with other values of its parameters, in their order."""
+        pairs = zip(self.parameters.items(), values, strict=True)
+        return replace(self, parameters={name: replace(p, value=value) for (name, p), value in pairs})
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry of the document."""
+        parameters = {name: dict(vars(p)) for name, p in self.parameters.items()}
+        definition = {"definition": self.definition} if self.definition else {}
+        return {"name": self.name, "parameters": parameters, **definition}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Return the object from the value of ``to_json``."""
+        keys = Coefficient.__dataclass_fields__
+        stated = {name: {k: v for k, v in p.items() if k in keys} for name, p in data["parameters"].items()}
+        return cls(data["name"], {n: Coefficient(**p) for n, p in stated.items()}, data.get("definition"))
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """The evidence that the estimate of a fit is a minimum."""
+
+    cosine: float  # largest between the residual and a column of the Jacobian
+    condition: float  # of the scaled columns; infinite is published as null
+    rank: int
+    parameters: int  # their number
+    cosine_at_minimum: float = COSINE_AT_MINIMUM
+    closed_form: bool = False
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry of the document."""
+        condition = self.condition if np.isfinite(self.condition) else None
+        return {k: v for k, v in vars(self).items() if k != "closed_form" or v} | {"condition": condition}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Return the object from the value of ``to_json``."""
+        return cls(**{**data, "condition": np.inf if data["condition"] is None else data["condition"]})
 
 
 @dataclass(frozen=True)
 class SensorCalibration:
-    """Calibration of one sensor after a stage.
-
-    ``convergence`` is the evidence that the estimate is a minimum: ``cosine``, the largest cosine between the residual
-    and a column of the Jacobian; ``condition`` and ``rank`` of its scaled columns; ``parameters``, their number.
-    """
+    """Calibration of one sensor after a stage."""
 
     sensor: str
     bias: Values = field(default_factory=lambda: np.zeros(3))  # (3,), g or deg/s
@@ -198,16 +382,14 @@ class SensorCalibration:
     converged: bool = True
     freedom: Values | None = None  # (p,), effective degrees of freedom; None: ``degrees_of_freedom`` for all
     budget: Budget | None = None
-    convergence: dict[str, Any] | None = None
+    convergence: Convergence | None = None
     # each (12, p), signed; change of bias and matrix by each parameter of an effect, absent in the model, at its limit
     at_limits: Mapping[str, Values] = field(default_factory=dict)
 
     @property
     def parameters(self) -> Parameters:
         """Bias, matrix and the parameters of each effect."""
-        of_effects = [
-            (f"{e.name}.{name}", str(p.get("unit", ""))) for e in self.effects for name, p in e.parameters.items()
-        ]
+        of_effects = [(f"{e.name}.{name}", p.unit) for e in self.effects for name, p in e.parameters.items()]
         names = (*BASE_NAMES, *(name for name, _ in of_effects))
         return Parameters(
             names,
@@ -250,12 +432,9 @@ class SensorCalibration:
             "effective_degrees_of_freedom": finite(parameters.degrees_of_freedom),
             "covariance": {"parameters": list(parameters.names), "values": parameters.covariance.tolist()},
             "stages": [stage.to_json() for stage in self.stages],
-            "effects": [
-                {"name": e.name, "parameters": e.parameters} | ({"definition": e.definition} if e.definition else {})
-                for e in self.effects
-            ],
+            "effects": [effect.to_json() for effect in self.effects],
             "converged": self.converged,
-            "convergence": self.convergence,
+            "convergence": self.convergence and self.convergence.to_json(),
             "uncertainty_budget": self.budget and self.budget.to_json(parameters),
             "at_limits": {name: change.tolist() for name, change in self.at_limits.items()},
         }
@@ -264,19 +443,19 @@ class SensorCalibration:
     def from_json(cls, sensor: str, data: dict[str, Any]) -> Self:
         """Return the object from the value of ``to_json``; null in the covariance: not known."""
         freedom, budget = data.get("effective_degrees_of_freedom"), data.get("uncertainty_budget")
-        covariance = np.array(data["covariance"]["values"], float)
+        covariance, convergence = np.array(data["covariance"]["values"], float), data.get("convergence")
         return cls(
             sensor=sensor,
             bias=np.array(data["bias"], float),
             matrix=np.array(data["matrix"], float),
             stages=tuple(map(StageResult.from_json, data["stages"])),
-            effects=tuple(FittedEffect(**e) for e in data["effects"]),
+            effects=tuple(map(FittedEffect.from_json, data["effects"])),
             covariance=None if np.isnan(covariance).all() else np.nan_to_num(covariance, copy=False),
             degrees_of_freedom=float("inf") if data["degrees_of_freedom"] is None else data["degrees_of_freedom"],
             converged=data["converged"],
             freedom=None if freedom is None else unlimited(freedom),
             budget=budget and Budget.from_json(budget),
-            convergence=data.get("convergence"),
+            convergence=convergence and Convergence.from_json(convergence),
             at_limits={name: np.array(change, float) for name, change in data.get("at_limits", {}).items()},
         )
 

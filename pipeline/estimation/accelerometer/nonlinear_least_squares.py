@@ -35,6 +35,7 @@ from pipeline.core.records import (
     Noise,
     NoMonteCarlo,
     SensorCalibration,
+    StageDetails,
     StageResult,
     Subtract,
     Values,
@@ -46,7 +47,6 @@ from pipeline.estimation.engine import LinearMap, ScaledColumns
 from pipeline.estimation.gauss_markov import WHITE_SETTING, WanderPrior
 from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
 from pipeline.estimation.multi_position.accelerometer import (
-    KNOWN_BY_LIMIT,
     PARAMETERS,
     AccelerometerModel,
     limit_of_misalignment,
@@ -65,7 +65,7 @@ from pipeline.estimation.multi_position.result import (
     with_stage,
 )
 from pipeline.estimation.noise import wander_prior
-from pipeline.estimation.rest_means import Orientations, describe_rests, orientations_of, sound_samples
+from pipeline.estimation.rest_means import Orientations, orientations_of, rest_uses, sound_samples
 from pipeline.estimation.stages import FitStage
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_turns, used_motions
@@ -414,19 +414,19 @@ def _parameters(solved: _Solved, covariance: Values) -> dict[str, Estimate]:
 
 def _stage(rows: Orientations, solved: _Solved, covariance: Values, freedom: float) -> StageResult:
     """Return the result of the stage; ``covariance``: (12, 12), of bias and matrix."""
-    details = {
-        "orientations_used": len(rows.rests.time),
-        "samples_used": int(rows.rests.count.sum()),
-        "rests_used": describe_rests(rows.used) if rows.by_hand else [],
-        "rests_left_out": describe_rests(rows.left_out),
-        "rests_held_out": describe_rests(rows.held_out),
-        KNOWN_BY_LIMIT: solved.model.known_by_limit,
-        "white_noise": float(np.sqrt(np.mean(rows.white**2))),
-        "scatter_between_rests": solved.between,
-        "largest_error": float(np.max(np.abs(solved.error))),
-        "condition": solved.fit.condition,
-        "cosine": solved.fit.cosine,
-        "degrees_of_freedom": freedom,
-    }
+    details = StageDetails(
+        orientations_used=len(rows.rests.time),
+        samples_used=int(rows.rests.count.sum()),
+        rests_used=rest_uses(rows.used) if rows.by_hand else [],
+        rests_left_out=rest_uses(rows.left_out),
+        rests_held_out=rest_uses(rows.held_out),
+        known_by_limit=solved.model.known_by_limit,
+        white_noise=float(np.sqrt(np.mean(rows.white**2))),
+        scatter_between_rests=solved.between,
+        largest_error=float(np.max(np.abs(solved.error))),
+        condition=solved.fit.condition,
+        cosine=solved.fit.cosine,
+        degrees_of_freedom=freedom,
+    )
     correction = Subtract(solved.fit.state.bias), Multiply(solved.fit.state.matrix)
     return StageResult(NAME, _parameters(solved, covariance), correction=correction, details=details)

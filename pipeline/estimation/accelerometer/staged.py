@@ -32,6 +32,7 @@ from pipeline.core.records import (
     AXES,
     BASE,
     BASE_COUNT,
+    Coefficient,
     Contribution,
     CorrectionStep,
     FittedEffect,
@@ -318,7 +319,7 @@ def fit(
         scatter.degrees_of_freedom,
     )
     last, named = name == "scale_factor", effect(ASYMMETRY).parameters("accelerometer")
-    asymmetry = {p.name: {"value": float(v), "unit": p.unit} for p, v in zip(named, found.c, strict=True)}
+    asymmetry = {p.name: Coefficient(float(v), p.unit) for p, v in zip(named, found.c, strict=True)}
     calibration = SensorCalibration(
         sensor="accelerometer",
         bias=found.bias,

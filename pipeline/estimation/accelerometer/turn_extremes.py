@@ -32,13 +32,13 @@ rest at either end, so that one sinusoid does not describe both.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from pipeline.core.errors import NotObservableError
-from pipeline.core.records import AXES, CorrectionStep, Mask, TwoSided, Values
-from pipeline.estimation.engine import ScaledColumns, convergence_evidence, linear_convergence_evidence
+from pipeline.core.records import AXES, Convergence, CorrectionStep, Mask, TwoSided, Values
+from pipeline.estimation.engine import ScaledColumns, linear_convergence
 from pipeline.estimation.turns import TurnPart, filtered_alike
 
 if TYPE_CHECKING:
@@ -247,10 +247,9 @@ def by_turn(sinusoids: Sequence[Sequence[Sinusoid]], values: Values) -> list[lis
     return [pieces[turn :: len(sinusoids)] for turn in range(len(sinusoids))]
 
 
-def convergence_of_sinusoids(sinusoids: Sequence[Sequence[Sinusoid]]) -> dict[str, Any]:
-    """Return the certificate of the sinusoids' fits: the largest cosine and condition of all."""
+def convergence_of_sinusoids(sinusoids: Sequence[Sequence[Sinusoid]]) -> Convergence:
+    """Return the evidence of the sinusoids' fits: the largest cosine and condition of all."""
     fits = [s for turn in sinusoids for s in turn]
-    parts = [linear_convergence_evidence(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in fits]
-    cosine, condition = (max(part[key] for part in parts) for key in ("cosine", "condition"))
-    count = sum(part["parameters"] for part in parts)
-    return convergence_evidence(cosine, condition, count, count)
+    parts = [linear_convergence(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in fits]
+    count = sum(part.parameters for part in parts)
+    return Convergence(max(part.cosine for part in parts), max(part.condition for part in parts), count, count)

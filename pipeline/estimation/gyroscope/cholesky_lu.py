@@ -48,11 +48,12 @@ from pipeline.core.records import (
     Multiply,
     Recording,
     SensorCalibration,
+    StageDetails,
     StageResult,
     Subtract,
     Values,
 )
-from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative, linear_convergence_evidence
+from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative, linear_convergence
 from pipeline.estimation.gyroscope.known_turns import covariances, known_turns, with_budget
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.multi_position.moves import trapezoids
@@ -142,23 +143,23 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
         parameters=stage_parameters(_values(factors), (scatter.covariance + of_bias)[AFTER_BASE, AFTER_BASE]),
         residual_rms=float(np.sqrt(np.mean(error**2))),
         correction=(Subtract(previous.bias), Multiply(matrix)),
-        details={
-            "turns": len(U),
-            "turns_left_out": turns.left_out,
-            "samples_used": len(turns.reading),
-            "angle_error_rms_deg": angle_errors,
-            "orthonormality_error": float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
-            "determinant_of_M": float(np.linalg.det(factors.M)),
-            "condition": float(np.linalg.cond(U / np.linalg.norm(U, axis=0))),
-            "degrees_of_freedom": float(scatter.degrees_of_freedom.min()),
-        },
+        details=StageDetails(
+            turns=len(U),
+            turns_left_out=turns.left_out,
+            samples_used=len(turns.reading),
+            angle_error_rms_deg=angle_errors,
+            orthonormality_error=float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
+            determinant_of_M=float(np.linalg.det(factors.M)),
+            condition=float(np.linalg.cond(U / np.linalg.norm(U, axis=0))),
+            degrees_of_freedom=float(scatter.degrees_of_freedom.min()),
+        ),
     )
     found = SensorCalibration(
         sensor="gyroscope",
         bias=previous.bias,
         matrix=matrix,
         stages=(*previous.stages, result),
-        convergence=linear_convergence_evidence(U, Y - U @ A.T, columns.condition, columns.rank),
+        convergence=linear_convergence(U, Y - U @ A.T, columns.condition, columns.rank),
     )
     lines = [scatter.of(BASE)]
     if np.any(of_bias):
@@ -190,20 +191,20 @@ def _fit_of_sheet(recordings: UnitRecordings, previous: SensorCalibration, setti
         parameters=stage_parameters(_values(factors), after[AFTER_BASE, AFTER_BASE]),
         residual_rms=float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
         correction=(Subtract(previous.bias), Multiply(matrix)),
-        details={
-            "turns": len(known.U),
-            "rests": len(known.rests.time),
-            "orthonormality_error": float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
-            "determinant_of_M": float(np.linalg.det(factors.M)),
-            "condition": float(np.linalg.cond(known.U / np.linalg.norm(known.U, axis=0))),
-        },
+        details=StageDetails(
+            turns=len(known.U),
+            rests=len(known.rests.time),
+            orthonormality_error=float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
+            determinant_of_M=float(np.linalg.det(factors.M)),
+            condition=float(np.linalg.cond(known.U / np.linalg.norm(known.U, axis=0))),
+        ),
     )
     found = SensorCalibration(
         sensor="gyroscope",
         bias=previous.bias,
         matrix=matrix,
         stages=(*previous.stages, stage),
-        convergence=linear_convergence_evidence(known.U, left, columns.condition, columns.rank),
+        convergence=linear_convergence(known.U, left, columns.condition, columns.rank),
     )
     base = J[BASE]
     return with_budget(found, base @ of_noise @ base.T, base @ of_stated @ base.T, settings)

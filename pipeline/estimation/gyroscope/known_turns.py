@@ -17,7 +17,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError
-from pipeline.core.records import AXES, BASE_COUNT, BIAS, NORMAL, Contribution, SensorCalibration, StageResult, Subtract
+from pipeline.core.records import (
+    AXES,
+    BASE_COUNT,
+    BIAS,
+    NORMAL,
+    Contribution,
+    SensorCalibration,
+    StageDetails,
+    StageResult,
+    Subtract,
+)
 from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
 from pipeline.estimation.multi_position.faces_and_turns import across_axis, turns_of
@@ -88,10 +98,8 @@ def fit_bias(recordings: UnitRecordings, settings: Settings) -> SensorCalibratio
     covariance = np.zeros((BASE_COUNT, BASE_COUNT))
     covariance[BIAS, BIAS] = np.diag(known.of_bias)
     values = {f"b_{axis}": (float(b), "deg/s") for axis, b in zip(AXES, known.bias, strict=True)}
-    details = {"rests": len(known.rests.time)}
-    stage = StageResult(
-        "bias", stage_parameters(values, np.diag(known.of_bias)), correction=(Subtract(known.bias),), details=details
-    )
+    parameters, details = stage_parameters(values, np.diag(known.of_bias)), StageDetails(rests=len(known.rests.time))
+    stage = StageResult("bias", parameters, correction=(Subtract(known.bias),), details=details)
     found = SensorCalibration("gyroscope", bias=known.bias, stages=(stage,))
     return combined(found, [scatter_contribution(covariance, np.inf)], dict(NOT_INCLUDED))
 

@@ -16,8 +16,9 @@ variance. Source: Lange, Little & Taylor, JASA 84 (1989), 881-896.
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -26,18 +27,19 @@ from pipeline.core.records import (
     BASE_COUNT,
     MATRIX,
     MATRIX_NAMES,
-    TURN_AXES,
     Multiply,
+    OutlyingMove,
     SensorCalibration,
+    StageDetails,
     StageResult,
     Subtract,
+    TurnAxes,
 )
 from pipeline.estimation.effects import accelerometer_of, frame_error
 from pipeline.estimation.engine import ScaledColumns
-from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.multi_position.fit import MIN_NEW_NORM_SHARE, with_limits
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
-from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, MOVED, model_of
+from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, model_of
 from pipeline.estimation.multi_position.model import ONE, State, prior_hypotheses
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
@@ -53,16 +55,14 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 
-    Found: TypeAlias = tuple[GyroscopeModel, FitByHand, list[dict[str, Any]]]
+    Found: TypeAlias = tuple[GyroscopeModel, FitByHand, list[OutlyingMove]]
 
 
 OUTLIER_FALSE_ALARM, FREEDOM = 1e-3, 4.0  # p and v
 ROBUST_ROUNDS, SETTLED_WEIGHT_CHANGE = 6, 0.05  # weights that change by less are final
 
 
-def fit_robustly(
-    model: GyroscopeModel, fit_model: Callable[..., FitByHand], recordings: Sequence[Recording]
-) -> tuple[GyroscopeModel, FitByHand, list[dict[str, Any]]]:
+def fit_robustly(model: GyroscopeModel, fit_model: Callable[..., FitByHand], recordings: Sequence[Recording]) -> Found:
     """Fit rests and moves, with weights of Student's t if a move is an outlier.
 
     ``fit_model``: function that fits a model, from ``start`` and what is ``known`` of it if given (``fit``). Returns
@@ -86,13 +86,13 @@ def fit_robustly(
         fitted = fit_model(model, start=fitted.state, known=(model.equations(fitted.state), fitted.scores))
         t, error = _over_noise(model, fitted)
     outlying = [
-        {
-            "recording": recordings[int(model.every.recording[moves.after[k]])].name,
-            "time_s": float(moves.time[k, 0]),
-            "error_deg": float(error[k]),
-            "over_noise": float(t[k]),
-            "weight": float(weight[k]),
-        }
+        OutlyingMove(
+            recording=recordings[int(model.every.recording[moves.after[k]])].name,
+            time_s=float(moves.time[k, 0]),
+            error_deg=float(error[k]),
+            over_noise=float(t[k]),
+            weight=float(weight[k]),
+        )
         for k in np.flatnonzero(t > limit)
     ]
     return model, fitted, outlying
@@ -173,30 +173,29 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     if not sheet:
         _require_known(u, moves, advice)
     apart = fitted.residual[model.of_moves] * fitted.error[model.of_moves]
-    details: dict[str, Any] = {
-        "rests": len(model.rests.time),
-        "moves": moves,
-        "direction_error_rms_deg": float(np.sqrt(np.mean(apart**2))) if moves else None,
-        "scatter_of_rests": fitted.noise.scatter[0],
-        "scatter_of_moves": fitted.noise.scatter[1] if moves else None,
-        "scatter_of_directions": fitted.noise.direction,
-        "moves_weighted_down": len(outlying),
-        "moves_outlying": outlying,
-        "condition": fitted.condition,
-        "degrees_of_freedom": float(fitted.degrees_of_freedom.min()),
-    }
-    if sheet:
-        details[KNOWN_BY_LIMIT] = dict(model.known_by_limit)
-    if faces:
-        details[MOVED] = moved.tolist()
+    details = StageDetails(
+        rests=len(model.rests.time),
+        moves=moves,
+        direction_error_rms_deg=float(np.sqrt(np.mean(apart**2))) if moves else None,
+        scatter_of_rests=fitted.noise.scatter[0],
+        scatter_of_moves=fitted.noise.scatter[1] if moves else None,
+        scatter_of_directions=fitted.noise.direction,
+        moves_weighted_down=len(outlying),
+        moves_outlying=outlying,
+        condition=fitted.condition,
+        degrees_of_freedom=float(fitted.degrees_of_freedom.min()),
+        known_by_limit=model.known_by_limit if sheet else None,
+        accelerometer_moved=moved.tolist() if faces else None,
+    )
     if model.turns is not None:
-        details["turns"] = model.turns.described(fitted.state)
-        off = fitted.residual * fitted.error
+        off, axes = fitted.residual * fitted.error, None
         by_hand = settings.table.motion == "none" or any(r.kind == "turn" for r in filtered)
         if sheet and procedure.turns and by_hand:
             needed = CLEARLY_BELOW * float(np.degrees(data_sheet.cross_axis / np.sqrt(3.0)))
-            details[TURN_AXES] = {"stated_deg": procedure.turns.axis_accuracy_deg, "needed_deg": needed}
-        details["departures"] = model.turns.departures(off[model.of_turns], fitted.deviation[model.of_turns])
+            axes = TurnAxes(procedure.turns.axis_accuracy_deg, needed)
+        departures = model.turns.departures(off[model.of_turns], fitted.deviation[model.of_turns])
+        angles = model.turns.described(fitted.state)
+        details = replace(details, turns=angles, turn_axes=axes, departures=departures)
     stage = StageResult(NAME, correction=(Subtract(fitted.state.bias), Multiply(fitted.state.matrix)), details=details)
     before = SensorCalibration("gyroscope", stages=previous.stages if previous else ())
     return after_stage(before, stage, model, fitted, settings, other=accelerometer)

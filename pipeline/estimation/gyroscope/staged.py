@@ -31,6 +31,7 @@ from pipeline.core.records import (
     AFTER_BASE,
     AXES,
     BASE,
+    Convergence,
     CorrectionStep,
     Mask,
     Multiply,
@@ -41,7 +42,7 @@ from pipeline.core.records import (
     corrected,
     motion_at_rest,
 )
-from pipeline.estimation.engine import LinearMap, ScaledColumns, convergence_evidence, derivative
+from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.stages import FitStage, staged_result
 from pipeline.estimation.table_errors import Reference
@@ -218,7 +219,7 @@ def fit(
         bias=offset,
         matrix=matrix,
         stages=(*(previous.stages if previous else ()), result),
-        convergence=convergence_evidence(0.0, condition, columns, columns) | {"closed_form": True},
+        convergence=Convergence(0.0, condition, columns, columns, closed_form=True),
     )
 
     def results(errors: Values) -> Values:

@@ -123,7 +123,6 @@ def parted(rests: Rests) -> tuple[Rests, Soaks | None]:
 FORCE_ITERATIONS = 12  # of effects that depend on the force
 SETTLED_FORCE_G = 1e-12  # g
 SMALLEST_NOISE = 1e-9  # g
-KNOWN_BY_LIMIT = "known_by_limit"  # in the details of a stage: parameters with a pseudo-observation, each with its u
 # Of b and the lower triangle of L.
 PARAMETERS = (
     "bias_x", "bias_y", "bias_z", "scale_factor_x", "misalignment_yx", "scale_factor_y", "misalignment_zx",
@@ -307,7 +306,7 @@ def model_of(
     held = rests_of("accelerometer", recordings, settings.procedure, role=HELD_OUT) or rests.select(rests.held_out)
     used, soaks = parted(rests.select(~rests.held_out))
     faces = faces_of(used, (used.reading - calibration.bias) @ calibration.matrix.T, settings.procedure.faces)
-    by_limit = {name: u for stage in calibration.stages for name, u in stage.details.get(KNOWN_BY_LIMIT, {}).items()}
+    by_limit = {name: u for stage in calibration.stages for name, u in (stage.details.known_by_limit or {}).items()}
     directions = _directions(calibration)
     return AccelerometerModel(
         used, directions, gravity, noise, held=held, faces=faces, known_by_limit=by_limit, soaks=soaks

@@ -28,12 +28,12 @@ a multiple of the stated angle (``pipeline.physics.signal.segments``).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
-from pipeline.core.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, Values
+from pipeline.core.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, TurnAngle, Values
 from pipeline.estimation.multi_position.model import EquationBlock, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import padded, sound_span, spans_between, tangents, trapezoids
 from pipeline.estimation.rest_means import ROLE, Rests
@@ -348,17 +348,17 @@ class TurnsByHand:
         turned = (self.stated[:, None] * self.direction) @ skew(np.eye(3)).transpose(0, 2, 1)  # (3, t, 3)
         return np.asarray(-self.frame * np.einsum("rti,kti->rk", self.rows, turned))
 
-    def described(self, state: State) -> list[dict[str, Any]]:
+    def described(self, state: State) -> list[TurnAngle]:
         """Return recording, start in s, axis, stated and calibrated total angle in deg of each turn."""
         angles = self._angles(state)
         return [
-            {
-                "recording": self.name[t],
-                "time_s": float(self.time[t, 0]),
-                "axis": name_of_axis(direction),
-                "stated_deg": float(self.stated[t]),
-                "angle_deg": float(angles[t]),
-            }
+            TurnAngle(
+                recording=self.name[t],
+                time_s=float(self.time[t, 0]),
+                axis=name_of_axis(direction),
+                stated_deg=float(self.stated[t]),
+                angle_deg=float(angles[t]),
+            )
             for t, direction in enumerate(self.direction)
         ]
 

@@ -33,7 +33,7 @@ import scipy
 
 from pipeline.core.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX, MATRIX_NAMES
 from pipeline.estimation.engine import cholesky, draw_normal
-from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT, SMALLEST_NOISE, white_of
+from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
 from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, turns_of
 from pipeline.estimation.multi_position.model import (
     EquationBlock,
@@ -66,7 +66,6 @@ if TYPE_CHECKING:
 MIN_MOVES = 6  # two equations each, for the nine of the matrix
 RATE_ITERATIONS = 6  # of effects that depend on the rate
 SETTLED_DPS = 1e-6  # change of the rate that ends these rounds: 1e-5 deg in 10 s, 2e-3 of the noise of a move
-MOVED = "accelerometer_moved"
 NORMAL_DEGREES_OF_FREEDOM = 1e6  # degrees of freedom beyond which Student's t is normal to 1e-6
 INTERVAL_DRAWS, INTERVAL_TAIL = 4000, 0.005  # as in the 99 % interval of other held-out errors: 20 draws are beyond it
 
@@ -396,9 +395,9 @@ def model_of(
     """
     details = [stage.details for stage in calibration.stages] if calibration else []
     if moved is None:
-        moved = next((np.array(d[MOVED]) for d in details if MOVED in d), None)
+        moved = next((np.array(d.accelerometer_moved) for d in details if d.accelerometer_moved is not None), None)
     if known_by_limit is None:
-        known_by_limit = next((d[KNOWN_BY_LIMIT] for d in details if KNOWN_BY_LIMIT in d), {})
+        known_by_limit = next((d.known_by_limit for d in details if d.known_by_limit is not None), {})
     observed = observed_rests(recordings, accelerometer, procedure, moved=moved)
     if observed is None:
         return None
@@ -406,7 +405,7 @@ def model_of(
     moves = None if accelerometer is None else moves_of(recordings, rests)
     turns = turns_of(recordings, rests, accelerometer, procedure, frame_deg=frame_deg)
     if moves is not None and calibration is not None:
-        outlying = {(move["recording"], float(move["time_s"])) for d in details for move in d.get("moves_outlying", ())}
+        outlying = {(move.recording, move.time_s) for d in details for move in d.moves_outlying or ()}
         names = [recordings[int(i)].name for i in rests.recording[moves.after]]
         keys = zip(names, moves.time[:, 0].tolist(), strict=True)
         moves = moves.select(np.array([key not in outlying for key in keys]))

@@ -350,7 +350,7 @@ def gravity_of(
         ends.append(np.where(creeps[:, None], near, steady))
         noise = np.where(creeps, np.maximum(noise, share), noise)
         creeping |= np.linalg.norm(near - u, axis=1) > SIGNIFICANT_OFFSET_DEVIATIONS * np.sqrt(share * white)
-    between = [float(stage.details.get("scatter_between_rests") or 0.0) for stage in accelerometer.stages]
+    between = [stage.details.scatter_between_rests or 0.0 for stage in accelerometer.stages]
     of_means = rests.own + np.mean(rests.rounding**2, axis=1)
     spread = np.sqrt(noise * white + of_means + max(between, default=0.0) ** 2)
     unsure = np.linalg.norm(force, axis=1) * np.radians(rests.creep_error) * 0.5 * rests.length

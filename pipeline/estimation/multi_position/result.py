@@ -16,8 +16,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.core.records import Contribution, Recording, SensorCalibration, StageResult, Values, base_values
-from pipeline.estimation.engine import convergence_evidence, draw_normal, scaled_inverse
+from pipeline.core.records import (
+    Contribution,
+    Convergence,
+    NoiseParts,
+    Recording,
+    SensorCalibration,
+    StageDetails,
+    StageResult,
+    Values,
+    base_values,
+)
+from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.monte_carlo import quadratic_results, with_trials
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
@@ -69,16 +79,16 @@ def calibration_of(
     other: SensorCalibration | None = None,
 ) -> SensorCalibration:
     """Convert a fit to a calibration with the stage ``effects``; ``other``: as of ``after_stage``."""
-    details = {
-        "samples": round(model.samples()),
-        "rests": len(model.rests.time),
-        "equations": len(fitted.residual),
-        "rounds": fitted.rounds,
-        "condition": fitted.condition if np.isfinite(fitted.condition) else None,
-        "wander_ratio": float(fitted.noise.bias.ratio),
-        "wander_time_s": float(fitted.noise.bias.time),
-        "scatter_over_noise": list(fitted.noise.scatter),
-    }
+    details = StageDetails(
+        samples=round(model.samples()),
+        rests=len(model.rests.time),
+        equations=len(fitted.residual),
+        rounds=fitted.rounds,
+        condition=fitted.condition,
+        wander_ratio=float(fitted.noise.bias.ratio),
+        wander_time_s=float(fitted.noise.bias.time),
+        scatter_over_noise=fitted.noise.scatter,
+    )
     return after_stage(before, StageResult("effects", details=details), model, fitted, settings, other=other)
 
 
@@ -93,8 +103,8 @@ def with_stage(before: SensorCalibration, stage: StageResult, model: Model, fitt
         matrix=fitted.state.matrix,
         stages=(*before.stages, replace(stage, residual_rms=rms)),
         converged=fitted.converged,
-        convergence=convergence_evidence(
-            fitted.cosine, fitted.condition, rank, len(fitted.covariance), at_minimum=fitted.cosine_at_minimum
+        convergence=Convergence(
+            fitted.cosine, fitted.condition, rank, len(fitted.covariance), fitted.cosine_at_minimum
         ),
     )
 
@@ -125,10 +135,10 @@ def after_stage(
     at_limits = _at_limits(model, fitted, place, other, settings)
     calibration = replace(calibration, effects=effects, at_limits=at_limits)
     limit, of_limit = limits_contribution(model, fitted)
-    variance, parts = np.clip(np.diag(covariance - of_limit), 0.0, None), {}
+    variance, parts = np.clip(np.diag(covariance - of_limit), 0.0, None), NoiseParts()
     if white is not None:
         white = np.minimum(white, variance)
-        parts = {"white noise": np.sqrt(white), "bias wander and scatter of the rests": np.sqrt(variance - white)}
+        parts = NoiseParts(np.sqrt(white), wander_and_scatter=np.sqrt(variance - white))
     scatter = scatter_contribution(covariance - of_limit, np.inf, parts, REMARK[sensor])
     lines, missing = [replace(scatter, degrees_of_freedom=freedom)], dict(not_included)
     if sensor == "accelerometer":
@@ -243,17 +253,17 @@ def fit_faces(before: SensorCalibration, recordings: UnitRecordings, settings: S
     across = np.degrees(np.einsum("rmc,mc->r", model.faces.weights(), force) / model.gravity).reshape(-1, 2)
     off = dict(zip(FACES, np.linalg.norm(across, axis=1).tolist(), strict=True))
     accuracy = stated.accuracy_deg
-    details = {
-        "departures": [
+    details = StageDetails(
+        departures=[
             f"face {name} is {angle:.1f} deg off the direction by the other faces, {angle / accuracy:.1f} times "
             "procedure.faces.accuracy_deg"
             for name, angle in off.items()
             if angle > DEPARTS * accuracy
         ],
-        "rests_on_faces": {name: int(np.count_nonzero(model.faces.face == i)) for i, name in enumerate(FACES)},
-        "face_off_deg": off,
-        "scatter_of_rests": fitted.noise.scatter[0],
-        "condition": fitted.condition,
-        "degrees_of_freedom": float(fitted.degrees_of_freedom.min()),
-    }
+        rests_on_faces={name: int(np.count_nonzero(model.faces.face == i)) for i, name in enumerate(FACES)},
+        face_off_deg=off,
+        scatter_of_rests=fitted.noise.scatter[0],
+        condition=fitted.condition,
+        degrees_of_freedom=float(fitted.degrees_of_freedom.min()),
+    )
     return after_stage(before, StageResult(NAME, details=details), model, fitted, settings)

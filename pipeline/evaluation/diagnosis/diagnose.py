@@ -35,6 +35,7 @@ import numpy as np
 from pipeline.core.errors import ConvergenceError, NotObservableError
 from pipeline.core.records import (
     MATRIX,
+    Coefficient,
     FittedEffect,
     MovesError,
     Noise,
@@ -236,10 +237,9 @@ def diagnose(
 
 def _scatter(calibration: SensorCalibration) -> float:
     """Return the scatter of moves or directions that a fit by hand found, over the noise; 0 for other fits."""
-    found = [
-        stage.details.get(f"scatter_of_{kind}") for stage in calibration.stages for kind in ("moves", "directions")
-    ]
-    return max((float(value) for value in found if value), default=0.0)
+    details = [stage.details for stage in calibration.stages]
+    found = [value for each in details for value in (each.scatter_of_moves, each.scatter_of_directions) if value]
+    return max(found, default=0.0)
 
 
 def held_out_of(validation: SensorValidation) -> HeldOutError | None:
@@ -474,7 +474,7 @@ def _of_effect(calibration: SensorCalibration, samples: Samples, found: SensorDi
     motion = samples.motion
     if entry is None or motion is None or not entry.parameters:
         return None
-    fitted = FittedEffect(name, {n: {"value": p.value, "unit": p.unit} for n, p in entry.parameters.items()})
+    fitted = FittedEffect(name, {n: Coefficient(p.value, p.unit) for n, p in entry.parameters.items()})
     this = effect_of(fitted)
     if any(getattr(motion, need) is None for need in this.needs):
         return None

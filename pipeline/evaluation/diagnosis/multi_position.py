@@ -137,7 +137,7 @@ def findings(case: DiagnosisInput) -> Findings:
         full=(lambda: calibrated(selection.fits[-1])) if selection.names else None,
         other=case.accelerometer if case.sensor == "gyroscope" else None,
         on_table=False,
-        departures=[text for stage in calibration.stages for text in stage.details.get("departures", ())],
+        departures=[text for stage in calibration.stages for text in stage.details.departures or ()],
         scatter_over_noise=float(best.scatter[0]),
         method_errors=given_differences(
             calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings

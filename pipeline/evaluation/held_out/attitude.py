@@ -31,6 +31,7 @@ from pipeline.core.records import (
     Noise,
     Recording,
     SensorCalibration,
+    StageDetails,
     Values,
     continuous,
     level_in_body,
@@ -251,8 +252,8 @@ def gravity_direction(
     found["creeping_rests"] = int(np.count_nonzero(gravity.creeping))
     if gyroscope.parameters.covariance[MATRIX, MATRIX].any():
         ratio = 0.0 if noise is None else float(np.mean(noise.wander / np.maximum(noise.white, 1e-300)))
-        details = gyroscope.stages[-1].details if gyroscope.stages else {}
-        moves, directions = (float(details.get(f"scatter_of_{each}") or 0.0) for each in ("moves", "directions"))
+        details = gyroscope.stages[-1].details if gyroscope.stages else StageDetails()
+        moves, directions = details.scatter_of_moves or 0.0, details.scatter_of_directions or 0.0
         of_fit = states["after"], covariance_without_reference(gyroscope), gyroscope.parameters.degrees_of_freedom
         found["largest_expected_rms_deg"] = model.largest_direction_error(*of_fit, (moves, directions), ratio)
         if model.moves.count < FEWEST_MOVES:
@@ -260,7 +261,7 @@ def gravity_direction(
             found["over_expected"] = model.weighted_direction_error(*of_fit, steady, ratio)
     if turns:
         found["turns"] = [
-            {**after, "angle_deg": {"before": before["angle_deg"], "after": after["angle_deg"]}}
+            {**vars(after), "angle_deg": {"before": before.angle_deg, "after": after.angle_deg}}
             for before, after in zip(*map(turns.described, states.values()), strict=True)
         ]
     return found

@@ -263,7 +263,6 @@ def _by_calibrated_log(calibration: SensorCalibration, effects: Sequence[FittedE
     return solve({sensor: SensorEffects.of(calibration, effects)}, readings, motion_of)[sensor]
 
 
-LACK_OF_FIT = "lack of fit"  # the part of a line of the budget that noise does not explain: 0 in a correct model
 TAIL = 0.005  # probability on each side of a 99 % interval
 # Probabilities at which the factors are computed; the weight of each is the probability between the middles.
 LEVELS = np.array([0.0005, 0.004, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.996, 0.9995])
@@ -330,7 +329,7 @@ def _changed(calibration: SensorCalibration, number: int, name: str, step: float
     """Return a calibration with a parameter of one of its effects changed by a step."""
     effects = list(calibration.effects)
     parameters = effects[number].parameters
-    changed = {**parameters[name], "value": parameters[name]["value"] + step}
+    changed = replace(parameters[name], value=parameters[name].value + step)
     effects[number] = replace(effects[number], parameters={**parameters, name: changed})
     return replace(calibration, effects=tuple(effects))
 
@@ -349,7 +348,7 @@ def expected_rms_error(
     """
     data_sheet = settings.sensor.of(calibration.sensor)
     step = 1.0 / data_sheet.counts_per_unit
-    wanders = [s.details["bias_wander"] for s in calibration.stages if "bias_wander" in s.details]
+    wanders = [s.details.bias_wander for s in calibration.stages if s.details.bias_wander is not None]
     residual_wander = np.array(wanders[-1]) if wanders else None  # of the residuals of the fit: (3,)
     time = data_sheet.wander_time_s
     drift = _drift(residual_wander, noise, data_sheet.bias_wander, time)
@@ -388,9 +387,9 @@ def _of_parameters(calibration: SensorCalibration, table: Table) -> tuple[Values
     out, nu = np.zeros((size + 1, size + 1)), np.full(size + 1, np.inf)
     if calibration.covariance is not None:
         covariance = covariance_without_reference(calibration)
-        of_lines = [line.parts for line in calibration.lines]
+        of_lines = [line.parts.lack_of_fit for line in calibration.lines]
         total, remaining = np.diag(calibration.covariance), np.diag(covariance)
-        lack = np.sum([np.square(parts[LACK_OF_FIT]) for parts in of_lines if LACK_OF_FIT in parts], axis=0)
+        lack = np.sum([np.square(part) for part in of_lines if part is not None], axis=0)
         scale = np.sqrt(np.clip(1.0 - lack / np.where(remaining > 0.0, remaining, 1.0), 0.0, 1.0)) * np.ones(size)
         out[:size, :size] = covariance * scale[:, None] * scale
         share = np.clip(remaining / np.where(total > 0.0, total, 1.0), 0.0, 1.0)

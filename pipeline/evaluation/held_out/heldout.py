@@ -48,7 +48,6 @@ from pipeline.core.records import (
 from pipeline.core.settings import Uncertainty
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.accelerometer.nonlinear_least_squares import PARAMETER_NAMES
-from pipeline.estimation.multi_position.accelerometer import KNOWN_BY_LIMIT
 from pipeline.estimation.rest_means import count_of_rests
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.evaluation.held_out.error_breakdown import (
@@ -314,9 +313,10 @@ def _why_not_held_out(case: HeldOutCase) -> str:
 
 def _fitted_exactly(calibration: SensorCalibration) -> int:
     """Return the number of rests by hand if the fit has a parameter for each, and so no residual; 0 otherwise."""
-    for details in (stage.details for stage in calibration.stages if stage.details.get("rests_used")):
-        if details["orientations_used"] + len(details[KNOWN_BY_LIMIT]) <= len(PARAMETER_NAMES):
-            return int(details["orientations_used"])
+    for stage in calibration.stages:
+        count, known = stage.details.orientations_used, stage.details.known_by_limit or {}
+        if stage.details.rests_used and count is not None and count + len(known) <= len(PARAMETER_NAMES):
+            return count
     return 0
 
 

@@ -172,8 +172,8 @@ class HeldOutCase:
         averaged = variance_of_average(counts.astype(np.float64) * recording.interval, noise.correlation_time)
         white = share[:, None] * noise.white**2 + own[:, None]
         if recording.kind == "slow":  # by the accelerations of the movement, as far as they scatter in the fit
-            details = [stage.details for stage in self.calibration.stages]
-            white = white + max((float(d.get("scatter_between_rests") or 0.0) for d in details), default=0.0) ** 2
+            scatters = [stage.details.scatter_between_rests or 0.0 for stage in self.calibration.stages]
+            white = white + max(scatters, default=0.0) ** 2
         if sensor == "gyroscope" and recording.accelerometer is not None:
             rate, unknown = _creep(recording, rests, other)
             reading, white = reading - rate, white + unknown

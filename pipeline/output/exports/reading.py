@@ -39,6 +39,7 @@ from pipeline.core.records import (
     SCHEMA_VERSION,
     SENSOR_UNITS,
     SENSORS,
+    Coefficient,
     FittedEffect,
     SensorCalibration,
 )
@@ -315,7 +316,7 @@ def _thermal(sensor: str, polynomial: Values, notes: list[str]) -> list[FittedEf
 def _fitted(name: str, sensor: str, values: Values) -> FittedEffect:
     """Return a built-in effect with its values and unknown uncertainty."""
     named = zip(effect(name).parameters(sensor), values.tolist(), strict=True)
-    return FittedEffect(name, {p.name: {"value": v, "unit": p.unit, "expanded_uncertainty": None} for p, v in named})
+    return FittedEffect(name, {p.name: Coefficient(v, p.unit) for p, v in named})
 
 
 CONVERSION_TOLERANCE = 1e-9  # g, deg/s or 1: smaller differences of a converted parameter are rounding

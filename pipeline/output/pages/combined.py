@@ -37,12 +37,14 @@ import numpy as np
 from pipeline.core.records import (
     BASE_COUNT,
     BIAS,
+    LACK_OF_FIT,
     NORMAL,
     SENSORS,
     Contribution,
     Index,
     Mask,
     SensorCalibration,
+    StageDetails,
     StageResult,
     Values,
     files_of_readings,
@@ -70,8 +72,7 @@ KIND = np.array([0, 0, 0, 1, 2, 2, 2, 1, 2, 2, 2, 1])  # of bias, diagonal and o
 STATED_ACCURACIES = "stated accuracies of the bench"
 EQUAL_SETTINGS = ("sensor", "method", "table")  # equal in the calibrations of one estimate
 LINE = "prior of the lot"
-LACK_OF_FIT = "lack of fit"  # errors of a table are part of it: siblings may have it in common
-SHARED_SOURCES = f"{STATED_ACCURACIES}, and {LACK_OF_FIT}"
+SHARED_SOURCES = f"{STATED_ACCURACIES}, and {LACK_OF_FIT}"  # errors of a table: siblings may have them in common
 NO_VALUES = np.empty(0)
 MOST_FREEDOM = 1e12  # instead of infinitely many degrees of freedom, for which JSON has no number
 # U is too small
@@ -149,7 +150,7 @@ def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
         Contribution(STATED_ACCURACIES, "B", NORMAL, np.mean(by_bench, axis=0), np.full(len(theta), np.inf)),
         Contribution("repeatability", "A", "Student's t", covariance - alone + np.diag(r2), scatter),
     ]
-    result = StageResult("combined", {}, None, None, {"calibrations": len(each), "repeatability": np.sqrt(r2).tolist()})
+    result = StageResult("combined", details=StageDetails(calibrations=len(each), repeatability=np.sqrt(r2).tolist()))
     first = replace(each[0], stages=(result,), converged=all(c.converged for c in each), convergence=None)
     return with_values(first, theta, lines).to_json()
 
@@ -163,10 +164,8 @@ def with_values(calibration: SensorCalibration, theta: Values, lines: Sequence[C
     """Return a calibration with other values, in the order of ``parameters``, and a budget of these contributions."""
     effects, at = [], BASE_COUNT
     for effect in calibration.effects:
-        values = theta[at : at + len(effect.parameters)].tolist()
-        described = {n: {**p, "value": v} for (n, p), v in zip(effect.parameters.items(), values, strict=True)}
-        effects.append(replace(effect, parameters=described))
-        at += len(described)
+        effects.append(effect.at(theta[at : at + len(effect.parameters)].tolist()))
+        at += len(effect.parameters)
     changed = replace(calibration, bias=theta[BIAS], matrix=matrix_of(theta), effects=tuple(effects))
     return budget_of(changed, lines, {})
 
@@ -283,7 +282,7 @@ def _divided(fit: SensorCalibration) -> tuple[Values, Values, tuple[Values, Valu
     has infinitely many.
     """
     readings, _ = own_and_bench(fit)
-    own, shared = own_and_bench(fit, LACK_OF_FIT)
+    own, shared = own_and_bench(fit, with_lack_of_fit=True)
     total = np.maximum(np.diag(own + shared), 1e-300)
     of_readings, of_own = np.diag(readings) / total, np.diag(own) / total
     effective, lack = fit.parameters.degrees_of_freedom, of_readings - of_own
@@ -372,7 +371,7 @@ def _sensor_with_prior(sensor: str, part: JSON, prior: UnitPrior) -> tuple[JSON,
         Contribution(LINE, "A", "Student's t", found.lot, found.lot_freedom, remark=remark),
         Contribution(SHARED_SOURCES, "B", NORMAL, shared * np.outer(growth, growth), of_shared),
     ]
-    stage = StageResult("lot_prior", {}, None, None, {"lot": prior.lot, "siblings": prior.siblings})
+    stage = StageResult("lot_prior", details=StageDetails(lot=prior.lot, siblings=prior.siblings))
     after = with_values(replace(fit, stages=(*fit.stages, stage)), found.values, lines)
     not_included = fit.budget.not_included if fit.budget else ()
     budget = after.budget and replace(after.budget, not_included=not_included)

@@ -176,9 +176,9 @@ def test_dwells_are_averaged_in_stop_and_go_and_samples_are_taken_singly_in_a_tu
     rng = np.random.default_rng(3)
     stop = fit(with_noise(_stop_and_go(rng), _settings()), None, _settings()).stages[-1].details
     turn = fit(with_noise(_continuous(rng), _settings()), None, _settings()).stages[-1].details
-    assert stop["orientations_used"] == 3 * 73
-    assert turn["orientations_used"] == turn["samples_used"] == 3000
-    assert stop["white_noise"] == pytest.approx(4e-3, rel=0.05)
+    assert stop.orientations_used == 3 * 73
+    assert turn.orientations_used == turn.samples_used == 3000
+    assert stop.white_noise == pytest.approx(4e-3, rel=0.05)
 
 
 def test_the_matrix_is_lower_triangular_and_its_upper_triangle_has_no_uncertainty() -> None:
@@ -247,9 +247,9 @@ def test_a_rest_that_contradicts_the_others_is_left_out_with_its_reason() -> Non
     assert recording.accelerometer is not None
     recording.accelerometer[325 * 10 : 325 * 10 + 250] *= 1.01
     calibration = fit(with_noise([recording], _settings()), None, _settings())
-    left_out = calibration.stages[-1].details["rests_left_out"]
-    assert [round(rest["time_s"] / 6.5) for rest in left_out] == [10]
-    assert "mg off the length by the other rests" in left_out[0]["reason"]
+    left_out = calibration.stages[-1].details.rests_left_out
+    assert [round(rest.time_s / 6.5) for rest in left_out] == [10]
+    assert "mg off the length by the other rests" in left_out[0].reason
     assert _vector(calibration) == pytest.approx(TRUTH, abs=5e-4)
 
 
@@ -267,7 +267,7 @@ def test_a_rest_is_left_out_only_beyond_what_the_largest_of_all_reaches_by_chanc
     low, high = 1.0, 1.02
     for _ in range(9):
         middle = 0.5 * (low + high)
-        gone = fit(with_noise([stretched(middle)], _settings()), None, _settings()).stages[-1].details["rests_left_out"]
+        gone = fit(with_noise([stretched(middle)], _settings()), None, _settings()).stages[-1].details.rests_left_out
         low, high = (low, middle) if gone else (middle, high)
     force = stretched(high).accelerometer
     assert force is not None
@@ -289,15 +289,15 @@ def test_a_rest_that_turned_is_left_out_with_its_reason() -> None:
     assert recording.accelerometer is not None
     recording.accelerometer[325 * 4 : 325 * 4 + 250, 0] += np.linspace(-0.05, 0.05, 250)
     details = fit(with_noise([recording], _settings()), None, _settings()).stages[-1].details
-    assert [round(rest["time_s"] / 6.5) for rest in details["rests_left_out"]] == [4]
-    assert "direction of the specific force moves" in details["rests_left_out"][0]["reason"]
-    assert details["orientations_used"] == 23
+    assert [round(rest.time_s / 6.5) for rest in details.rests_left_out] == [4]
+    assert "direction of the specific force moves" in details.rests_left_out[0].reason
+    assert details.orientations_used == 23
 
 
 def test_held_out_rests_are_in_no_fit() -> None:
     recording = _by_hand(_spread(24), np.random.default_rng(11))
     first = fit(with_noise([recording], _settings(3)), None, _settings(3))
-    assert first.stages[-1].details["orientations_used"] == 16
+    assert first.stages[-1].details.orientations_used == 16
     assert recording.accelerometer is not None
     for rest in held_out_rests([recording], _settings(3).procedure)["recording"]:
         recording.accelerometer[rest.start : rest.stop] *= 1.001
@@ -312,7 +312,7 @@ def test_six_positions_give_bias_and_scale_factors_and_the_limit_of_each_misalig
     calibration = fit(with_noise([_by_hand(faces, np.random.default_rng(12))], _settings()), None, _settings())
     stage, part = calibration.stages[-1], calibration.to_json()
     names = ["misalignment_yx", "misalignment_zx", "misalignment_zy"]
-    assert stage.details["known_by_limit"] == pytest.approx(dict.fromkeys(names, U_OF_LIMIT))
+    assert stage.details.known_by_limit == pytest.approx(dict.fromkeys(names, U_OF_LIMIT))
     for name in names:
         assert stage.parameters[name].standard_uncertainty == pytest.approx(U_OF_LIMIT, rel=0.02)
     assert (part["convergence"]["rank"], part["convergence"]["parameters"]) == (6, 9)
@@ -331,10 +331,10 @@ def test_one_misalignment_alone_may_be_left_undetermined() -> None:
     turns = np.concatenate([np.column_stack([o, s, c]), np.column_stack([s, o, c]), [[1, 0, 0], [0, 1, 0]]])
     recording = _by_hand(turns, np.random.default_rng(13), noise=1e-3)
     calibration = fit(with_noise([recording], _settings()), None, _settings())
-    assert list(calibration.stages[-1].details["known_by_limit"]) == ["misalignment_yx"]
-    assert calibration.convergence["rank"] == 8
+    assert list(calibration.stages[-1].details.known_by_limit) == ["misalignment_yx"]
+    assert calibration.convergence.rank == 8
     known = fit(with_noise([_by_hand(_spread(24), np.random.default_rng(13))], _settings()), None, _settings())
-    assert known.convergence["rank"] == 9
+    assert known.convergence.rank == 9
     assert not_determined(known.to_json()) == ""
 
 
@@ -352,7 +352,7 @@ def test_misalignments_within_the_limit_are_covered_where_few_rests_do_not_deter
         L = np.linalg.cholesky((inverse.T @ inverse)[::-1, ::-1])[::-1, ::-1].T
         recording = _by_hand(up @ K.T @ MATRIX.T, rng, noise=2e-3)  # its readings are those of the matrix MATRIX
         calibration = fit(with_noise([recording], _settings()), None, _settings())
-        limited += bool(calibration.stages[-1].details["known_by_limit"])
+        limited += bool(calibration.stages[-1].details.known_by_limit)
         truth = np.concatenate([BIAS, L.ravel()])[FITTED]
         U = np.array(calibration.to_json()["uncertainty_budget"]["expanded_uncertainty"])[FITTED]
         inside.append(np.abs(_vector(calibration) - truth) < U)
@@ -389,7 +389,7 @@ def test_a_published_recording_gives_the_factory_certificate() -> None:
     calibration = fit(with_noise([recording], _settings(gravity_g=PADUA_G)), None, _settings(gravity_g=PADUA_G))
     assert clock.process_time() - begin < 1.0
     stage = calibration.stages[-1]
-    assert stage.details["orientations_used"] == 38
+    assert stage.details.orientations_used == 38
     assert stage.residual_rms is not None
     assert stage.residual_rms < 0.12e-3
     assert calibration.bias * COUNTS_PER_G + 32768.0 == pytest.approx([33123, 33276, 32360], abs=6.0)
@@ -420,7 +420,7 @@ def test_a_published_mpu6050_recording_agrees_with_its_authors() -> None:
         gyroscope=counts[:, 3:] / 131.0,
     )
     calibration = fit(with_noise([recording], _settings()), None, _settings())
-    assert calibration.stages[-1].details["orientations_used"] == 10
+    assert calibration.stages[-1].details.orientations_used == 10
     # Theirs are no better than that: two of their ten intervals reach into a move.
     assert calibration.bias * 16384.0 == pytest.approx([711.5, -358.5, -1840.1], abs=30.0)
     scale = 9.80665 * np.diag(calibration.matrix) / 16384.0

@@ -109,7 +109,7 @@ def test_scale_factors_axes_and_mounting_are_exact_without_noise(rates: tuple[fl
     assert lower == pytest.approx(T, abs=1e-10)
     assert mounting == pytest.approx(M, abs=1e-10)
     assert calibration.matrix @ FORWARD == pytest.approx(np.eye(3), abs=1e-10)
-    assert calibration.stages[-1].details["turns"] == 3 * len(rates)
+    assert calibration.stages[-1].details.turns == 3 * len(rates)
 
 
 def test_m_is_orthonormal_whatever_the_noise() -> None:
@@ -213,7 +213,7 @@ def test_turns_in_both_directions_without_a_rest_between_count_as_two() -> None:
         )
 
     calibration = _fit([back_and_forth(axis, 2000 * k) for k, axis in enumerate("xyz")])
-    assert calibration.stages[-1].details["turns"] == 6
+    assert calibration.stages[-1].details.turns == 6
     assert calibration.matrix @ FORWARD == pytest.approx(np.eye(3), abs=1e-9)
 
 
@@ -226,7 +226,7 @@ def test_a_turn_with_clipped_readings_is_left_out_and_counted() -> None:
     reading[moving[10]] = 0.0
     recordings[0] = dataclasses.replace(recordings[0], gyroscope=reading, flags=flags)
     calibration = _fit(recordings)
-    assert (calibration.stages[-1].details["turns"], calibration.stages[-1].details["turns_left_out"]) == (8, 1)
+    assert (calibration.stages[-1].details.turns, calibration.stages[-1].details.turns_left_out) == (8, 1)
     assert calibration.matrix @ FORWARD == pytest.approx(np.eye(3), abs=1e-9)
 
 
@@ -234,14 +234,14 @@ def test_a_recording_whose_every_row_is_clipped_changes_nothing() -> None:
     recordings = _campaign(np.random.default_rng(6))
     clipped = dataclasses.replace(recordings[0], flags=np.full(recordings[0].samples, 0b10, np.uint16))
     alone, both = _fit(recordings), _fit([*recordings, clipped])
-    assert both.stages[-1].details["turns_left_out"] == 3
+    assert both.stages[-1].details.turns_left_out == 3
     assert np.array_equal(alone.matrix, both.matrix)
     assert np.allclose(alone.covariance, both.covariance, rtol=1e-9, atol=0.0)
 
 
 def test_the_angle_errors_are_a_table_of_turn_axes_by_sensor_axes() -> None:
     stage = _fit(_campaign(np.random.default_rng(3))).stages[-1]
-    errors = np.array(stage.details["angle_error_rms_deg"], float)
+    errors = np.array(stage.details.angle_error_rms_deg, float)
     assert errors.shape == (3, 3)
     assert np.max(errors) < 0.3  # of 360 deg, by noise of 0.05 deg/s and a bias wander of 0.003 deg/s
     assert stage.residual_rms == pytest.approx(0.068, rel=0.15)  # of |w| - rate, at rest and in turns

@@ -65,8 +65,8 @@ def test_sparse_samples_cost_the_matrix_nothing_beside_noise() -> None:
     unit = hand_held("stim300", 3)
     found = unit.calibrated("gyroscope")
     details = found.stages[-1].details
-    assert details["direction_error_rms_deg"] < 0.02
-    assert details["scatter_of_rests"] == 0.0
+    assert details.direction_error_rms_deg < 0.02
+    assert details.scatter_of_rests == 0.0
     assert np.abs(found.matrix - unit.true_matrix("gyroscope")).max() < 3e-4
 
 

@@ -39,10 +39,10 @@ def test_moves_far_off_the_others_are_told_and_take_no_part() -> None:
     drawn = draw(Hand(), 21)
     off, begin = knocked(drawn, [8, 20])  # every third rest from the second is held out, with the move before it
     sound, found = (rests_and_moves.fit(with_noise([d.recording], d.settings), None, d.settings) for d in (drawn, off))
-    assert sound.stages[-1].details["moves_outlying"] == []
-    told = found.stages[-1].details["moves_outlying"]
-    assert [move["time_s"] for move in told] == pytest.approx(begin, abs=0.02)
-    assert all(move["over_noise"] > 10.0 and move["weight"] < 0.1 for move in told)
+    assert sound.stages[-1].details.moves_outlying == []
+    told = found.stages[-1].details.moves_outlying
+    assert [move.time_s for move in told] == pytest.approx(begin, abs=0.02)
+    assert all(move.over_noise > 10.0 and move.weight < 0.1 for move in told)
     assert sound.covariance is not None
     u = np.sqrt(np.diag(sound.covariance))[3:].reshape(3, 3)
     assert np.abs(found.matrix - sound.matrix).max() < u.max()

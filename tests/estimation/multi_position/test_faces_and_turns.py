@@ -41,7 +41,7 @@ def without(session: Session, start_s: float, stop_s: float) -> Session:
 @pytest.mark.parametrize("sensor", ["accelerometer", "gyroscope"])
 def test_both_matrices_are_full_and_within_their_uncertainty(whole: Session, sensor: str) -> None:
     error, u, freedom = whole.errors(sensor)
-    assert not whole.fit(sensor).stages[-1].details["departures"]
+    assert not whole.fit(sensor).stages[-1].details.departures
     assert np.all(u > 0.0)
     assert np.all(np.abs(error) < stats.t.ppf(1.0 - 1e-3 / 24, freedom) * u)
 
@@ -71,11 +71,9 @@ def test_turns_alone_give_scale_and_direction_to_the_stated_accuracy() -> None:
     _, u, _ = session.errors("gyroscope")
     assert np.all(u[[3, 7, 11]] < 1.3 * turns.accuracy_deg / 360.0)
     assert np.all(u[OFF_DIAGONAL] < 1.3 * np.radians(turns.axis_accuracy_deg))
-    told = found.stages[-1].details["turns"]
-    assert [(t["recording"], t["axis"], abs(t["stated_deg"])) for t in told] == [
-        (f"{axis}_rot", axis, 360.0) for axis in "xyz"
-    ]
-    assert all(abs(t["angle_deg"] - t["stated_deg"]) < 4.0 * turns.accuracy_deg for t in told)
+    told = found.stages[-1].details.turns
+    assert [(t.recording, t.axis, abs(t.stated_deg)) for t in told] == [(f"{axis}_rot", axis, 360.0) for axis in "xyz"]
+    assert all(abs(t.angle_deg - t.stated_deg) < 4.0 * turns.accuracy_deg for t in told)
 
 
 def test_an_accurate_stop_gives_an_accurate_scale() -> None:
@@ -90,7 +88,7 @@ def test_a_hand_that_departs_from_what_is_stated_is_doubted() -> None:
     stated = {"turns": {"accuracy_deg": 0.3}, "faces": {"accuracy_deg": 0.1}}
     session = simulated(8, procedure=stated)
     found = {sensor: session.fit(sensor) for sensor in ("accelerometer", "gyroscope")}
-    told = {sensor: fit.stages[-1].details["departures"] for sensor, fit in found.items()}
+    told = {sensor: fit.stages[-1].details.departures for sensor, fit in found.items()}
     assert any("times procedure.faces.accuracy_deg" in text for text in told["accelerometer"])
     assert any("times procedure.turns.accuracy_deg" in text for text in told["gyroscope"])
     noise = estimate_noise("gyroscope", session.recordings, session.settings.sensor.gyroscope)

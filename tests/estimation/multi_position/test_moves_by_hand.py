@@ -149,7 +149,7 @@ def test_moves_that_are_clipped_below_the_stated_range_are_left_out_and_named(sh
             marked.calibrated("gyroscope")
         return
     found = marked.calibrated("gyroscope")
-    assert found.stages[-1].details["moves"] == left
+    assert found.stages[-1].details.moves == left
     assert np.abs(found.matrix - unit.true_matrix("gyroscope")).max() < 3e-4  # 0.1 with the clipped moves
     assert marked.diagnosed("gyroscope", calibration=found)["verdict"] == "nothing_missing"
 

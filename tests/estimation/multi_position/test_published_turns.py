@@ -121,11 +121,11 @@ def test_the_example_session_agrees_with_ferraris_1995(tmp_path: Path, sensor: s
     found = FITS[sensor].fit(with_noise(recordings, settings), None, settings)
     assert np.abs(difference(found, ferraris(force, rate, RATE_HZ, -360.0)[sensor])).max() < 2.0
     if sensor == "gyroscope":
-        turns = found.stages[-1].details["turns"]
-        assert [(t["axis"], t["stated_deg"]) for t in turns] == [("x", -360.0), ("y", -360.0), ("z", -360.0)]
-        assert max(abs(t["angle_deg"] - t["stated_deg"]) for t in turns) < 2.0 * PROCEDURE.turns.accuracy_deg
+        turns = found.stages[-1].details.turns
+        assert [(t.axis, t.stated_deg) for t in turns] == [("x", -360.0), ("y", -360.0), ("z", -360.0)]
+        assert max(abs(t.angle_deg - t.stated_deg) for t in turns) < 2.0 * PROCEDURE.turns.accuracy_deg
     else:
-        assert sum(found.stages[-1].details["rests_on_faces"].values()) == 13
+        assert sum(found.stages[-1].details.rests_on_faces.values()) == 13
 
 
 @pytest.mark.parametrize("sensor", list(FITS))
