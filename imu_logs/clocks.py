@@ -56,6 +56,21 @@ YEAR_2000, YEAR_2100 = 946_684_800 * SECOND_NS, 4_102_444_800 * SECOND_NS
 MIN_MESSAGES = 3  # messages of a sensor: a row has a neighbour on both sides
 MAX_GAP_INTERVALS = 1.5  # times the median interval, as of a recording's rows
 MAX_FLOAT_RESOLUTION = 0.01  # of the median interval: coarsest resolution of a time in floating-point numbers
+SHORTEST_NS = 25_000  # below the interval of 32 kHz, the fastest output of an IMU (ICM-42688-P, data sheet, GYRO_ODR)
+IN_BURST = 0.5  # of the mean interval: at least half of the intervals are shorter where samples arrive in bursts
+FEWEST_UNTIMED = 0.01  # share of rows without a time of their own, above which it is no single fault
+UNTIMED = 0.95  # share of the rows of bursts that have no time of their own, if none has
+REPEATED = 0.5  # share of such rows that repeat the row before them, above which they were logged twice
+MIN_BURSTS = 3  # bursts, to call them so
+FEWEST_BURSTS = 10  # that determine a clock
+# of the interval: a tenth of what the clock of a MEMS sensor may be off (configs/sensor)
+MAX_INTERVAL_UNCERTAINTY = 1e-3
+MARGIN_INTERVALS = 0.5  # of the interval
+ONE_SENSOR = 6.0  # standard errors
+SAME_SIZE, MAX_BURST_DISTANCE = 0.8, 1.5  # share of bursts of the usual size +-1; times the usual distance
+READ_OUT_NS, LARGEST_FIFO = 2_000_000, 4096  # interval of rows while a FIFO is read by I2C, and its rows
+# of the time between bursts, and of a burst; longer ones are of a logger that pauses
+MAX_BURST_SHARE, LONGEST_NS = 0.25, 1e9
 
 
 def nanoseconds(moment: tuple[int, int] | float | Decimal, unit: str) -> int:
@@ -240,23 +255,6 @@ def _edges(slow: Integers) -> Integers:
     """Return the middles between messages: start and end of the interval of each message but the first and last."""
     edges: Integers = slow[:-1] + np.diff(slow) // 2
     return edges
-
-
-SHORTEST_NS = 25_000  # below the interval of 32 kHz, the fastest output of an IMU (ICM-42688-P, data sheet, GYRO_ODR)
-IN_BURST = 0.5  # of the mean interval: at least half of the intervals are shorter where samples arrive in bursts
-FEWEST_UNTIMED = 0.01  # share of rows without a time of their own, above which it is no single fault
-UNTIMED = 0.95  # share of the rows of bursts that have no time of their own, if none has
-REPEATED = 0.5  # share of such rows that repeat the row before them, above which they were logged twice
-MIN_BURSTS = 3  # bursts, to call them so
-FEWEST_BURSTS = 10  # that determine a clock
-# of the interval: a tenth of what the clock of a MEMS sensor may be off (configs/sensor)
-MAX_INTERVAL_UNCERTAINTY = 1e-3
-MARGIN_INTERVALS = 0.5  # of the interval
-ONE_SENSOR = 6.0  # standard errors
-SAME_SIZE, MAX_BURST_DISTANCE = 0.8, 1.5  # share of bursts of the usual size +-1; times the usual distance
-READ_OUT_NS, LARGEST_FIFO = 2_000_000, 4096  # interval of rows while a FIFO is read by I2C, and its rows
-# of the time between bursts, and of a burst; longer ones are of a logger that pauses
-MAX_BURST_SHARE, LONGEST_NS = 0.25, 1e9
 
 
 @dataclass(frozen=True)

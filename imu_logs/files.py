@@ -19,29 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-class MessageFormat(NamedTuple):
-    """A kind of log other than text and MCAP: its name, and the module and the extra of the package that read it."""
-
-    kind: str
-    library: str
-    extra: str
-
-
-MESSAGE_FORMATS = {
-    ".bag": MessageFormat("ROS 1 bag", "rosbags.rosbag1", "ros"),
-    ".db3": MessageFormat("ROS 2 bag (SQLite)", "rosbags.rosbag2", "ros"),
-    ".ulg": MessageFormat("ULog", "pyulog", "ulog"),
-    ".bin": MessageFormat("DataFlash", "pymavlink.DFReader", "ardupilot"),
-    ".h5": MessageFormat("HDF5", "h5py", "hdf5"),
-    ".hdf5": MessageFormat("HDF5", "h5py", "hdf5"),
-    ".mat": MessageFormat("MATLAB", "h5py", "hdf5"),
-    ".tlog": MessageFormat("MAVLink telemetry", "pymavlink.mavutil", "ardupilot"),
-    ".tdms": MessageFormat("TDMS", "nptdms", "tdms"),
-    ".npy": MessageFormat("NumPy", "numpy", ""),
-    ".npz": MessageFormat("NumPy", "numpy", ""),
-}
 ZIP = ".zip"  # of text logs
-SUFFIXES = (".csv", ".gcsv", ".mcap", *MESSAGE_FORMATS, ZIP, ".BIN")  # .BIN: as ArduPilot names its logs
 KINDS = {
     stat.S_IFDIR: "a directory",
     stat.S_IFIFO: "a FIFO",
@@ -90,12 +68,34 @@ FOREIGN = {
     b"\xff\xfe": UTF_16,
     b"\xfe\xff": UTF_16,
 }
-
-
 SECOND_PLACE = {b"ftyp": "a video (MP4): extract its telemetry by gpmf-parser or Gyroflow, as .gcsv"}  # from byte 4
 MAVLINK = b"\xfd\xfe"  # starts of a packet of MAVLink 2 and 1, after a time in us, big endian
 TLOG = "a MAVLink telemetry log: give it the suffix .tlog"
 YEARS_US = (946_684_800_000_000, 4_102_444_800_000_000)  # 2000 to 2100
+
+
+class MessageFormat(NamedTuple):
+    """A kind of log other than text and MCAP: its name, and the module and the extra of the package that read it."""
+
+    kind: str
+    library: str
+    extra: str
+
+
+MESSAGE_FORMATS = {
+    ".bag": MessageFormat("ROS 1 bag", "rosbags.rosbag1", "ros"),
+    ".db3": MessageFormat("ROS 2 bag (SQLite)", "rosbags.rosbag2", "ros"),
+    ".ulg": MessageFormat("ULog", "pyulog", "ulog"),
+    ".bin": MessageFormat("DataFlash", "pymavlink.DFReader", "ardupilot"),
+    ".h5": MessageFormat("HDF5", "h5py", "hdf5"),
+    ".hdf5": MessageFormat("HDF5", "h5py", "hdf5"),
+    ".mat": MessageFormat("MATLAB", "h5py", "hdf5"),
+    ".tlog": MessageFormat("MAVLink telemetry", "pymavlink.mavutil", "ardupilot"),
+    ".tdms": MessageFormat("TDMS", "nptdms", "tdms"),
+    ".npy": MessageFormat("NumPy", "numpy", ""),
+    ".npz": MessageFormat("NumPy", "numpy", ""),
+}
+SUFFIXES = (".csv", ".gcsv", ".mcap", *MESSAGE_FORMATS, ZIP, ".BIN")  # .BIN: as ArduPilot names its logs
 
 
 def kind_of(start: bytes) -> str:

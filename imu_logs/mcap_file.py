@@ -65,6 +65,16 @@ HEAD = np.dtype({
     "itemsize": RECORD_HEAD + MESSAGE_HEAD,
 })  # fmt: skip
 _RECORD, _HEAD = struct.Struct("<BQ"), struct.Struct("<BQH")
+DEFINITIONS = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
+ONLY_IN_DATA = frozenset({
+    Opcode.HEADER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA,
+    Opcode.DATA_END,
+})  # fmt: skip
+ONLY_IN_SUMMARY = frozenset(Opcode) - ONLY_IN_DATA - frozenset(DEFINITIONS)
+_KINDS = frozenset(Opcode)
+COPY_AGAIN = "copy the file again from its source"
+RUN_SIZE = 1 << 20  # bytes of messages outside chunks that are returned together, as the recorders' usual chunk
+_RECORD = struct.Struct("<BQ")
 
 
 @dataclass
@@ -281,18 +291,6 @@ def message_index(content: bytes) -> tuple[int, Integers]:
     if (offsets > np.iinfo(np.int64).max).any():
         raise ValueError("an index of messages has an offset beyond 63 bits")
     return number, offsets.astype(np.int64)
-
-
-DEFINITIONS = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
-ONLY_IN_DATA = frozenset({
-    Opcode.HEADER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA,
-    Opcode.DATA_END,
-})  # fmt: skip
-ONLY_IN_SUMMARY = frozenset(Opcode) - ONLY_IN_DATA - frozenset(DEFINITIONS)
-_KINDS = frozenset(Opcode)
-COPY_AGAIN = "copy the file again from its source"
-RUN_SIZE = 1 << 20  # bytes of messages outside chunks that are returned together, as the recorders' usual chunk
-_RECORD = struct.Struct("<BQ")
 
 
 class _TruncatedError(Exception):

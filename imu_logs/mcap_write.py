@@ -123,6 +123,7 @@ VECTORS = {
     "angular_velocity": ("gyroscope", "rad/s", np.pi / 180.0),
 }
 CHANNEL_AT = 9  # byte offset of the channel's number in a record
+ZSTD_LEVEL = -3  # twice as fast as 1 on calibrated messages, and as small as the recorders' 3: benchmarks/apply.py
 
 
 def _count(value: int) -> bytes:
@@ -285,9 +286,6 @@ def new_imu(
     table[:, : HEAD.itemsize] = heads.view(np.uint8).reshape(count, HEAD.itemsize)
     table[:, HEAD.itemsize :] = messages
     return table
-
-
-ZSTD_LEVEL = -3  # twice as fast as 1 on calibrated messages, and as small as the recorders' 3: benchmarks/apply.py
 
 
 class _Sink(Protocol):

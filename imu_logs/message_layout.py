@@ -51,6 +51,8 @@ LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 BIG_ENDIAN = b"\x00\x00"
 MAX_NESTED_TYPES = 32  # types within types
 MOST_FIELDS = 100_000  # of one message; nested arrays of empty messages would not end
+ONLY = "*"
+STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
 
 
 @dataclass(frozen=True)
@@ -280,10 +282,6 @@ class _LayoutFinder:
         else:
             for index in range(count):
                 self.message(item.type, f"{path}[{index}].", depth + 1)
-
-
-ONLY = "*"
-STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
 
 
 def place_of(path: FieldPath, layout: MessageLayout) -> tuple[int, str] | None:

@@ -68,6 +68,8 @@ SHIPPED = {
     "sensor_combined": "px4_ulog", "sensor_accel": "px4_raw", "sensor_gyro": "px4_raw", "IMU": "ardupilot",
 }  # fmt: skip
 Entries = dict[str, dict[str, Any]]
+WIDTH = 116  # of comments in a proposed profile
+WORD = re.compile(r"[A-Za-z_][\w.-]*(/[\w^]+)?")
 
 
 @dataclass
@@ -490,10 +492,6 @@ def fields_of(columns: Entries) -> Entries:
         c: {"field": e["column"], **{k: v for k, v in e.items() if k not in ("column", "optional")}}
         for c, e in columns.items()
     }
-
-
-WIDTH = 116  # of comments in a proposed profile
-WORD = re.compile(r"[A-Za-z_][\w.-]*(/[\w^]+)?")
 
 
 def as_yaml(proposal: Proposal, name: str) -> str:

@@ -56,6 +56,9 @@ HINTS = {
     "restarted": PARTS,
 }
 END_OF_NUMBER = re.compile(r"[\d.,eE+-]+")
+FIRST_LINES = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
+LONGEST_HEADER = 1 << 16  # bytes that are searched for the line of names
+LAST_VERSION = "1.3"
 
 
 def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[int, str]) -> list[tuple[Column, int]]:
@@ -296,11 +299,6 @@ def _fault_of_cell(
         return "decimal_comma", f"{label} ({channel}) is {text!r}, a decimal comma; write numbers with a point"
     kind = "not_finite" if re.fullmatch(r"[+-]?(nan|inf(inity)?)", text, re.IGNORECASE) else "not_a_number"
     return kind, f"{label} ({channel}) is {text[:40]!r}; a finite number is expected"
-
-
-FIRST_LINES = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
-LONGEST_HEADER = 1 << 16  # bytes that are searched for the line of names
-LAST_VERSION = "1.3"
 
 
 def gcsv_format(path: Path) -> tuple[CsvFormat, dict[str, str]]:

@@ -52,6 +52,15 @@ if TYPE_CHECKING:
 LINES_BELOW, SEARCHED_BELOW = 60, 10_000  # lines, bytes after a header without the columns, searched for another
 LINES, EXACT = -1, -2  # instead of a column's index: numbers of the lines, times in ns
 MOST_REFUSED = 10_000  # bad lines after which the rest of the file is not searched for more
+EXACT_BELOW_S = 1e6  # half a nanosecond is 2^-53 of 4.5e6 s
+MAX_TIME_S = 9.2e9  # int64 nanoseconds end at 292 years
+DECIMAL_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # of whole nanoseconds
+MAX_TIME_RESOLUTION = 0.01  # of the median interval
+NEAR_INTERVALS = 2.5  # intervals
+LARGEST_DISPLACEMENT = 5  # rows
+MOST_LISTED = 5  # parts of a log, in a refusal
+SHORTEST_PART = 10  # rows; a shorter part is rows with a wrong time
+RESET_INTERVALS = 5  # a time that goes back by more begins another session
 
 
 def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks | None = None) -> Log:
@@ -262,17 +271,6 @@ def read_gcsv(path: Path, checks: Checks) -> Log:
     layout, stated = gcsv_format(path)
     table = _read_one(path, layout, checks)
     return replace(table, source={**table.source, "gcsv": stated})
-
-
-EXACT_BELOW_S = 1e6  # half a nanosecond is 2^-53 of 4.5e6 s
-MAX_TIME_S = 9.2e9  # int64 nanoseconds end at 292 years
-DECIMAL_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # of whole nanoseconds
-MAX_TIME_RESOLUTION = 0.01  # of the median interval
-NEAR_INTERVALS = 2.5  # intervals
-LARGEST_DISPLACEMENT = 5  # rows
-MOST_LISTED = 5  # parts of a log, in a refusal
-SHORTEST_PART = 10  # rows; a shorter part is rows with a wrong time
-RESET_INTERVALS = 5  # a time that goes back by more begins another session
 
 
 def time_column(layout: TextLayout) -> tuple[Column, int]:

@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from pipeline.core.settings import Settings
 
 
+EFFECTS_STAGE = "effects"  # of a fit, after the stages of its method
+DOCUMENTS = ("calibration", "validation", "diagnosis")
+BENCH_SECTIONS = ("sensor", "table", "procedure")
+
+
 class Step(NamedTuple):
     """A step of the chain."""
 
@@ -29,9 +34,6 @@ class Step(NamedTuple):
     returns: str  # attribute of ``UnitState`` that it returns; of ``fits``, the entry of one sensor
 
 
-EFFECTS_STAGE = "effects"  # of a fit, after the stages of its method
-DOCUMENTS = ("calibration", "validation", "diagnosis")
-BENCH_SECTIONS = ("sensor", "table", "procedure")
 STEPS = {  # in the order of a run
     "ingest": Step("ingest.ingest", ("files",), (*BENCH_SECTIONS, "ingest"), "checked"),
     "filter": Step("filter.filter_recordings", ("checked",), ("sensor", "filter"), "recordings"),

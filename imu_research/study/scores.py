@@ -41,6 +41,21 @@ GATES = (6.0, 8.0, MIN_DELTA_BIC, 12.0, 14.0, 16.0, 18.0, MIN_DELTA_BIC_OF_SLOW)
 OF_SENSOR_FILE = ("white", "normal")  # noise of the families that the sensor file describes
 STANDS_OUT = 100.0  # lambda: the largest that a selection needs
 DOUBTFUL_VERDICTS = (Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUBT)
+SETS = (
+    "single", "one_axis", "staged", "lost", "coarse", "cold", "pairs", "pairs_wander", "triples", "unseen", "null",
+)  # fmt: skip  # families whose truth is a set of effects of the catalogue that the recordings can show
+# Family: the share of the detection size, and the goal of the median limit over the truth.
+LIMIT_GOALS = {"limit_30": ("0.3", 4.0), "limit_60": ("0.6", 2.2), "limit_100": ("1", 1.6)}
+EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 1.0)  # of stated probabilities
+EDGES_OF_SETS = (0.0, 0.95, 0.96, 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 0.999, 1.0)  # of sets with at least 0.95
+Probability = Literal["effects", "single answers", "answer sets"]
+PROBABILITIES: tuple[Probability, ...] = ("effects", "single answers", "answer sets")
+GOAL, FAMILY_GOAL, SIZE_GOAL = ">= 93.6 %", ">= 90 %", 3.0
+STYLE = (
+    "<style>.chart{background:#fff}text{font:12px sans-serif;fill:#57606a}.e{text-anchor:end}.m{text-anchor:middle}"
+    "path{fill:none;stroke:currentColor;stroke-width:1.5;vector-effect:non-scaling-stroke}.grid{stroke:#d0d7de}"
+    ".dots{stroke-width:6;stroke-linecap:round}.dashed{stroke-dasharray:4}.c2{color:#1d5fbf}.c5{color:#8b949e}</style>"
+)
 
 
 def named(case: ScoredCase, hidden: str, name: str) -> bool:
@@ -252,23 +267,6 @@ def mean_excess_gone(cases: Iterable[ScoredCase]) -> list[MeasuredFigure]:
     mean, half = float(values.mean()), Z * float(values.std(ddof=1) / np.sqrt(len(values)))
     least = f"held-out excess over the noise floor that is gone with what was selected, mean (least {values.min():.0%})"
     return [MeasuredFigure(least, mean, len(values), ">= 98 %", (mean - half, mean + half))]
-
-
-SETS = (
-    "single", "one_axis", "staged", "lost", "coarse", "cold", "pairs", "pairs_wander", "triples", "unseen", "null",
-)  # fmt: skip  # families whose truth is a set of effects of the catalogue that the recordings can show
-# Family: the share of the detection size, and the goal of the median limit over the truth.
-LIMIT_GOALS = {"limit_30": ("0.3", 4.0), "limit_60": ("0.6", 2.2), "limit_100": ("1", 1.6)}
-EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 1.0)  # of stated probabilities
-EDGES_OF_SETS = (0.0, 0.95, 0.96, 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 0.999, 1.0)  # of sets with at least 0.95
-Probability = Literal["effects", "single answers", "answer sets"]
-PROBABILITIES: tuple[Probability, ...] = ("effects", "single answers", "answer sets")
-GOAL, FAMILY_GOAL, SIZE_GOAL = ">= 93.6 %", ">= 90 %", 3.0
-STYLE = (
-    "<style>.chart{background:#fff}text{font:12px sans-serif;fill:#57606a}.e{text-anchor:end}.m{text-anchor:middle}"
-    "path{fill:none;stroke:currentColor;stroke-width:1.5;vector-effect:non-scaling-stroke}.grid{stroke:#d0d7de}"
-    ".dots{stroke-width:6;stroke-linecap:round}.dashed{stroke-dasharray:4}.c2{color:#1d5fbf}.c5{color:#8b949e}</style>"
-)
 
 
 def true_set(case: ScoredCase) -> list[str]:

@@ -46,6 +46,17 @@ if TYPE_CHECKING:
     from pipeline.output.pages.comparison import MeanWithUncertainty
 
 
+PROCEDURES = {"accelerometer": (*STOPS, *CONTINUOUS), "gyroscope": RATES}
+BELOW = {"accelerometer": "stop and go, rest in s; continuous, deg/s", "gyroscope": "rate, deg/s"}
+FILTER_NAMES = {
+    "staged": "RC low-pass",
+    "same-gain": "the same gain without delay",
+    "zero-phase": "run both ways, the gain twice",
+    "unfiltered": "no filter",
+}
+OURS = ("printed", "ours, as printed", "ours, errata corrected")
+
+
 def render(campaign: Path, folder: Path) -> str:
     """Render ``thesis.html`` from a campaign with ``printed/`` and ``seeds.csv``, and the folder of its results."""
     printed, results = campaign / "printed", Results(folder)
@@ -95,17 +106,6 @@ def key_of(explanations: Sequence[JSON], cell: JSON) -> str:
     """Return the key of the first explanation whose pattern matches a cell; empty for none."""
     place = "|".join(cell[name] for name in ("table", "block", "row", "column"))
     return next((str(e["key"]) for e in explanations if re.search(e["where"], place)), "")
-
-
-PROCEDURES = {"accelerometer": (*STOPS, *CONTINUOUS), "gyroscope": RATES}
-BELOW = {"accelerometer": "stop and go, rest in s; continuous, deg/s", "gyroscope": "rate, deg/s"}
-FILTER_NAMES = {
-    "staged": "RC low-pass",
-    "same-gain": "the same gain without delay",
-    "zero-phase": "run both ways, the gain twice",
-    "unfiltered": "no filter",
-}
-OURS = ("printed", "ours, as printed", "ours, errata corrected")
 
 
 def all_figures(printed: Path, results: Results, rows: pd.DataFrame, scatter: pd.DataFrame) -> list[Figure]:

@@ -65,6 +65,8 @@ if sys.platform == "linux":  # else threadpoolctl starts the program ldconfig to
     getattr(ThreadpoolController, "_system_libraries", {}).setdefault("libc", CDLL(None))
 NO_EFFECTS = UserEffectFiles(formulas=[], python=[])
 NO_CAMPAIGN = Path(__file__).with_name("no_campaign")  # does not exist: no options or effects of a campaign
+DIGITS = 5  # significant, of the figures that are printed
+WIDTH = 120  # characters of a printed line
 
 
 @dataclass(frozen=True)
@@ -306,10 +308,6 @@ def _text_of(name: str, recording: Any) -> bytes:  # noqa: ANN401  (the user's)
         kind = type(recording).__name__
         raise InputError(f"recording {name}: the path of a file or a pandas DataFrame is expected; got {kind}")
     return canonical_csv(f"{name} {IN_MEMORY}", recording)
-
-
-DIGITS = 5  # significant, of the figures that are printed
-WIDTH = 120  # characters of a printed line
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,6 +63,13 @@ FEWEST_CHANGES = 2  # of the reading: without them nothing is known between the 
 # of Newton's method; change of the log posterior; share of a step
 MAX_NEWTON_ITERATIONS, SETTLED_LOG_POSTERIOR, MIN_STEP_SHARE = 40, 1e-3, 1e-3
 DOUBLE_ROUNDING = 1e-12  # relative: some thousand roundings of a double
+MIN_STEP_ROWS, APART = 20, 8  # rows, see above
+RESOLUTION_NOTE = "N-RESOLUTION"
+SAME_STEP = 1e-6  # relative: rounding of a difference of decimals
+MAX_SIGNIFICANT_DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
+SAME_GRAVITY_G = 1e-4  # gravity changes by as much over 0.3 km of height
+OF_DECIMALS = 200  # samples that determine the decimals: a finer reading ends in a zero in a tenth of them
+MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
 
 
 def refined(recordings: Sequence[Recording]) -> list[Recording]:
@@ -191,15 +198,6 @@ class _Curve:
         first = (at_a - at_b) / noise
         second = np.maximum((at_b * b - at_a * a) / noise**2 + first**2, 0.0)
         return float(self.count @ log), self.count * np.where(above, -first, first), self.count * second
-
-
-MIN_STEP_ROWS, APART = 20, 8  # rows, see above
-RESOLUTION_NOTE = "N-RESOLUTION"
-SAME_STEP = 1e-6  # relative: rounding of a difference of decimals
-MAX_SIGNIFICANT_DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
-SAME_GRAVITY_G = 1e-4  # gravity changes by as much over 0.3 km of height
-OF_DECIMALS = 200  # samples that determine the decimals: a finer reading ends in a zero in a tenth of them
-MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
 
 
 def check_recordings(recordings: Sequence[Recording], settings: Settings) -> list[Recording]:

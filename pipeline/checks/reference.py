@@ -91,6 +91,19 @@ RESOLVED_DEG = 1e-3  # of a logged angle: the tenth of a common encoder's 0.01 d
 CURVED = 0.02  # relative error by nonlinearities of a gyroscope's gain that is fitted to the same turn
 OF_SENSOR = ("gyroscope", "gravity")
 PHASE = 0.2  # relative error of gravity's phase over some degrees: twice 0.1 g of bias
+MIN_REFERENCE_SAMPLES = 32  # samples, two short stretches
+# of the usual gain, which the axis turned about reaches; of an interval, between its end and its mean
+MIN_SHARE_OF_USUAL_GAIN = 0.5
+SAME_GAIN = 0.1  # relative difference between gains of one gyroscope in two turns
+FURTHEST, FURTHEST_S = 25, 10.0  # samples of delay that are tried at least, and s at most
+DELAY_STEP_S = 0.05  # step in which delays are tried; a parabola finds what lies between
+CLOCKS = 4001  # rates of the clock that are tried: 5 us in 1 s where it may be off by 1 %
+RESTING_RATE_SHARE = 0.01  # of the fastest rate of a turn, below which the table rests
+QUARTER = 0.25  # of an interval, within which a delay between samples is known
+BETTER = 0.5  # share of the power of the difference of two signals below which they are alike
+NEARLY = 0.1  # share of the power by which one delay has to be better than a smaller one
+SURE_END_DEVIATIONS = 5.0  # standard deviations of the sum of squares that the ends of the window add
+ALIGN = "align the table's log with the sensor's rows, or give it a separate time column (ingest=table_log)"
 
 
 class ChannelComparison:
@@ -240,21 +253,6 @@ def _slide(values: Values, before: int, after: int, count: int, better: np.ufunc
         out = better(out[:-step], out[step:])
         have += step
     return np.asarray(out[:count])
-
-
-MIN_REFERENCE_SAMPLES = 32  # samples, two short stretches
-# of the usual gain, which the axis turned about reaches; of an interval, between its end and its mean
-MIN_SHARE_OF_USUAL_GAIN = 0.5
-SAME_GAIN = 0.1  # relative difference between gains of one gyroscope in two turns
-FURTHEST, FURTHEST_S = 25, 10.0  # samples of delay that are tried at least, and s at most
-DELAY_STEP_S = 0.05  # step in which delays are tried; a parabola finds what lies between
-CLOCKS = 4001  # rates of the clock that are tried: 5 us in 1 s where it may be off by 1 %
-RESTING_RATE_SHARE = 0.01  # of the fastest rate of a turn, below which the table rests
-QUARTER = 0.25  # of an interval, within which a delay between samples is known
-BETTER = 0.5  # share of the power of the difference of two signals below which they are alike
-NEARLY = 0.1  # share of the power by which one delay has to be better than a smaller one
-SURE_END_DEVIATIONS = 5.0  # standard deviations of the sum of squares that the ends of the window add
-ALIGN = "align the table's log with the sensor's rows, or give it a separate time column (ingest=table_log)"
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 WRITE_AGAIN = "run the same command again: snakemake writes the file anew"
 _encoder = json.JSONEncoder(ensure_ascii=False, allow_nan=False, default=lambda array: array.tolist())  # numpy arrays
 _flushed_at_end: list[Path] = []  # folders whose files are flushed together
+Check = Callable[[Any], Any]
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
@@ -176,9 +177,6 @@ def flush_file_system(folder: Path) -> None:
 def canonical_json(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)
     """Return JSON with sorted keys and no blanks, for digests."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-
-
-Check = Callable[[Any], Any]
 
 
 class WrongValueError(Exception):

@@ -27,6 +27,15 @@ if TYPE_CHECKING:
 
 Files = dict[str, Any]  # name to bytes, text, or a value that is written as JSON
 COMPRESSION_LEVEL = 1  # of zlib: takes 7.5 ms per MB of pages; level 6 takes 22 ms and saves 17 % (pages of data/demo)
+PACKS, WITH_PRIOR = "packs", "prior"
+PACKED_STEPS = ("calibration", "validate", "diagnose", "export", "report", "summary")
+FAILED_SUFFIX = ".failed.json"
+INCOMPLETE_SUFFIX = ".incomplete.json"  # what stages after the fit could not make: a list of records as of a failure
+STAGE_OF = {  # folder of the results: the stage whose packs contain its files
+    "calibrations": "calibration", "validations": "validate", "diagnoses": "diagnose", "exports": "export",
+    "reports": "report", "certificates": "report",
+}  # fmt: skip
+DOCUMENT_FOLDERS = ("calibrations", "validations", "diagnoses")
 
 
 class Pack:
@@ -117,17 +126,6 @@ def as_bytes(content: Any) -> bytes:  # noqa: ANN401
     if isinstance(content, bytes):
         return content
     return (content if isinstance(content, str) else json_text(content) + "\n").encode()
-
-
-PACKS, WITH_PRIOR = "packs", "prior"
-PACKED_STEPS = ("calibration", "validate", "diagnose", "export", "report", "summary")
-FAILED_SUFFIX = ".failed.json"
-INCOMPLETE_SUFFIX = ".incomplete.json"  # what stages after the fit could not make: a list of records as of a failure
-STAGE_OF = {  # folder of the results: the stage whose packs contain its files
-    "calibrations": "calibration", "validations": "validate", "diagnoses": "diagnose", "exports": "export",
-    "reports": "report", "certificates": "report",
-}  # fmt: skip
-DOCUMENT_FOLDERS = ("calibrations", "validations", "diagnoses")
 
 
 class Batch:

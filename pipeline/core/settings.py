@@ -37,6 +37,11 @@ FileKind = Literal["rest", "attitudes", "turn", "moves", "slow", "soak", "table"
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 SettingOfSensor = TypeVar("SettingOfSensor")
 AnySection = TypeVar("AnySection", bound="Section")
+OfAxes = Annotated[list[Finite], Field(min_length=3, max_length=3)]  # x, y, z
+OF_BENCH = ("seat_deg", "time_offset_s", "clock_accuracy_ppm", "lag_s")  # keys of a table: priors in configs/effect
+Text = Annotated[str, Field(min_length=1)] | None
+Date = Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")] | None
+REQUIRED_FIGURES = ("noise_density", "bias_wander", "wander_time_s", "bias", "scale_factor", "cross_axis", "effects")
 
 
 class Section(BaseModel):
@@ -75,9 +80,6 @@ def _partial(model: type[AnySection], content: Mapping[str, Any]) -> AnySection:
     kinds: dict[str, Any] = {name: fields[name].annotation for name in content}
     sections = {n: k for n, k in kinds.items() if isinstance(k, type) and issubclass(k, Section)}
     return _constructed(model, {n: _partial(sections[n], v) if n in sections else v for n, v in content.items()})
-
-
-OfAxes = Annotated[list[Finite], Field(min_length=3, max_length=3)]  # x, y, z
 
 
 class KnownTemperature(Section):
@@ -127,9 +129,6 @@ class Sensor(Section):
         """Return the figures of the accelerometer or the gyroscope."""
         found: DataSheet = getattr(self, name)
         return found
-
-
-OF_BENCH = ("seat_deg", "time_offset_s", "clock_accuracy_ppm", "lag_s")  # keys of a table: priors in configs/effect
 
 
 class Table(Section):
@@ -326,10 +325,6 @@ class Ingest(Section, Profile):
     """The format of recordings (``imu_logs.Profile``)."""
 
 
-Text = Annotated[str, Field(min_length=1)] | None
-Date = Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")] | None
-
-
 class Organisation(Section):
     """A laboratory or a customer."""
 
@@ -503,9 +498,6 @@ SECTIONS: dict[str, type[Section]] = {
     for name, field in Unit.model_fields.items()
     if isinstance(field.annotation, type) and issubclass(field.annotation, Section)
 }
-
-
-REQUIRED_FIGURES = ("noise_density", "bias_wander", "wander_time_s", "bias", "scale_factor", "cross_axis", "effects")
 
 
 def completed(sensor: Mapping[str, Any], generic: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,6 +16,28 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 
+WITH_THEM = " (with which U of the "  # between open effects and the uncertainty, in summary.csv and sentences
+MARK_ABOVE_FLOORS = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good
+FAILED, INCOMPLETE, IMPLAUSIBLE, NOT_HELD_OUT = "failed", "incomplete", "implausible", "not_held_out"
+FAR, BEYOND_ACCEPTANCE, READY = "far_above_noise", "beyond_acceptance", "ready"
+SETTING = re.compile(r"\(([a-z_.]+=\w+)\)")  # a setting within a next step
+FIGURES = {  # what decides a verdict: in the words of pages, index, terminal and ``summary.csv``, and what it is over
+    "held_out": ("held-out error", ""),  # over the noise: see ``Error``
+    "misfit": ("misfit of the fit", "noise"),
+    "scatter": ("scatter of the moves", "noise"),
+    "angle": ("angle after held-out moves", "noise"),
+    "angle_expected": ("angle after held-out moves", "the largest expected"),
+    "dependence": ("dependence of the residual on", ""),
+    "check": ("check of the recordings", ""),
+    "static": ("mean of the static recording", "the largest expected"),
+    "agreement": ("matrix on held-out motion", "U"),
+    "below": ("held-out error", "the least expected"),
+    "method": ("difference from a free fit", ""),
+    "held": ("parameters that the sensor file determines", ""),
+}
+DECIDED = re.compile(r"(?P<figure>.+), (?P<times>\S+) x (?P<of>.+)")
+
+
 class Verdict(StrEnum):
     """A verdict, in the order in which lists name them: what can be added first, then what is in doubt."""
 
@@ -38,12 +60,7 @@ def css_class(verdict: str | None) -> str:
     return Verdict(verdict).css_class if verdict in set(Verdict) else ""
 
 
-WITH_THEM = " (with which U of the "  # between open effects and the uncertainty, in summary.csv and sentences
-MARK_ABOVE_FLOORS = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good
 DOUBTS = {Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUBT, Verdict.LEFT_BY_METHOD}
-FAILED, INCOMPLETE, IMPLAUSIBLE, NOT_HELD_OUT = "failed", "incomplete", "implausible", "not_held_out"
-FAR, BEYOND_ACCEPTANCE, READY = "far_above_noise", "beyond_acceptance", "ready"
-SETTING = re.compile(r"\(([a-z_.]+=\w+)\)")  # a setting within a next step
 
 
 class Kind(NamedTuple):
@@ -95,23 +112,6 @@ KINDS = {  # the most urgent first
     BEYOND_ACCEPTANCE: Kind("fails its limits", "beyond a limit of acceptance", "see the unit's page", "bad"),
     READY: Kind("ready", "calibrated; nothing that the recordings can show is missing", "apply it", "good"),
 }  # fmt: skip
-
-
-FIGURES = {  # what decides a verdict: in the words of pages, index, terminal and ``summary.csv``, and what it is over
-    "held_out": ("held-out error", ""),  # over the noise: see ``Error``
-    "misfit": ("misfit of the fit", "noise"),
-    "scatter": ("scatter of the moves", "noise"),
-    "angle": ("angle after held-out moves", "noise"),
-    "angle_expected": ("angle after held-out moves", "the largest expected"),
-    "dependence": ("dependence of the residual on", ""),
-    "check": ("check of the recordings", ""),
-    "static": ("mean of the static recording", "the largest expected"),
-    "agreement": ("matrix on held-out motion", "U"),
-    "below": ("held-out error", "the least expected"),
-    "method": ("difference from a free fit", ""),
-    "held": ("parameters that the sensor file determines", ""),
-}
-DECIDED = re.compile(r"(?P<figure>.+), (?P<times>\S+) x (?P<of>.+)")
 
 
 def decided_words(figure: str, times: float | None = None, named: str = "") -> str:

@@ -72,6 +72,14 @@ MOTION_FIELDS = (  # fields of ``Motion`` on which formulas depend
     "direction",
 )  # fmt: skip
 Result = TypeVar("Result")
+OTHER_PREFIX = "other_"  # prefix of the names of free curves
+BEND = ":bend"  # suffix of the name of the second form; answers state it under the name of the first
+BEND_WIDTHS = np.geomspace(0.1, 0.5, 12)  # of a bend, shares of the span: sharper ones are steps, wider ones parabolas
+# Prior probability of a bend over that of an effect. With it, a bend was an answer in all 54 simulated units (seed 61)
+# that hid one and selected a slow effect, and below 0.5 in all 34 (seed 62) that hid the slow effect.
+MAX_BEND_SHARE_OF_ROOM = 0.5
+CURVE_DEGREE = 5  # up to four turning points over the span; faster changes are steps
+MAX_CURVE_CYCLES = 8  # periods a turn
 
 
 @dataclass(frozen=True)
@@ -399,16 +407,6 @@ class Design:
             local, total = self.places(c)
             squares[total] += (self.size[local] / self.scale[c]) ** 2  # each index once
         return np.sqrt(squares)
-
-
-OTHER_PREFIX = "other_"  # prefix of the names of free curves
-BEND = ":bend"  # suffix of the name of the second form; answers state it under the name of the first
-BEND_WIDTHS = np.geomspace(0.1, 0.5, 12)  # of a bend, shares of the span: sharper ones are steps, wider ones parabolas
-# Prior probability of a bend over that of an effect. With it, a bend was an answer in all 54 simulated units (seed 61)
-# that hid one and selected a slow effect, and below 0.5 in all 34 (seed 62) that hid the slow effect.
-MAX_BEND_SHARE_OF_ROOM = 0.5
-CURVE_DEGREE = 5  # up to four turning points over the span; faster changes are steps
-MAX_CURVE_CYCLES = 8  # periods a turn
 
 
 class FreeCurve(Effect):

@@ -62,6 +62,9 @@ MAX_NEWTON_STEPS, SMALL_QUANTILE_STEP = 60, 1e-5  # of Newton's method for a qua
 NEGLIGIBLE_HYPOTHESIS_WEIGHT = 1e-6
 MIN_EIGENVALUE_SHARE = 1e-12  # of the eigenvalues of a scaled matrix: the rounding of a double, with a margin
 AVERAGED_OUT = 1e-3  # share of a column's size in block means, below which it does not absorb their noise
+RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
+PART_OF_NULL_SPACE = 1e-3  # component of a unit vector of it, above which a parameter is named as not determined
+ROW_SUM_RIDGE = 1e-9  # 1e7 times the rounding of a double, for sums over many rows; 3e-5 of a standard deviation
 
 
 @dataclass(frozen=True)
@@ -380,11 +383,6 @@ def derivative(function: Callable[[Values], Values], x: Values, step: Values) ->
     """Return the (n, m) derivative of a function of (m,) by central differences with a step for each input."""
     steps = np.diag(step)
     return np.stack([(function(x + h) - function(x - h)) / (2.0 * h.sum()) for h in steps], axis=-1)
-
-
-RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
-PART_OF_NULL_SPACE = 1e-3  # component of a unit vector of it, above which a parameter is named as not determined
-ROW_SUM_RIDGE = 1e-9  # 1e7 times the rounding of a double, for sums over many rows; 3e-5 of a standard deviation
 
 
 @dataclass(frozen=True)

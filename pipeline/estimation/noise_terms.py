@@ -68,6 +68,7 @@ LARGEST_DAMPING = 1e4
 LOG_LEAST = -690.0  # of a squared coefficient: above the smallest double
 
 Composition = tuple[int, ...]  # a set of stochastic terms: their kinds, in rising order
+Result = TypeVar("Result")
 
 
 def unit_of(term: str, unit: str) -> str:
@@ -261,7 +262,6 @@ class TermFits:
 
 
 FIT_FIELDS = tuple(f.name for f in fields(TermFits))
-Result = TypeVar("Result")
 if TYPE_CHECKING:
     Work = Generator[list[TermTrial], TermFits, Result]  # yields trials, receives their fits, returns a result
 

@@ -65,6 +65,9 @@ UPPER_LIMIT_SHARE = 29.0 / 30.0  # of an upper limit, see above
 LIMIT_SET_SHARE = 0.05  # share of the best probability, above which a set is used for upper limits
 QUANTILE_ITERATIONS, QUANTILE_PRECISION = 40, 1e-9  # iterations for a quantile; their relative precision
 MAX_NORMAL_DEVIATIONS = 40.0  # standard deviations: beyond them the normal distribution is 0 or 1 in doubles
+WORTH_A_FIT = 0.01  # probability of the sets with the same other timing effects, above which these are fitted
+MOST_FITS = 3  # of other timing effects
+LEAST_LAG_S = 1e-4  # a smaller lag has the column of a time offset, whose sign is free
 
 
 @dataclass(frozen=True)
@@ -323,11 +326,6 @@ def excluded(effects: Sequence[Effect]) -> dict[str, EffectSet]:
             barred[this.name].add(other)
             barred[other].add(this.name)
     return {name: frozenset(others) for name, others in barred.items() if others}
-
-
-WORTH_A_FIT = 0.01  # probability of the sets with the same other timing effects, above which these are fitted
-MOST_FITS = 3  # of other timing effects
-LEAST_LAG_S = 1e-4  # a smaller lag has the column of a time offset, whose sign is free
 
 
 def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Effect] = ()) -> Answers:

@@ -74,6 +74,11 @@ if TYPE_CHECKING:
 
 
 SOURCE = "known effects"  # of the uncertainty budget
+GIVEN, GIVEN_SOURCE = "given", "given calibration"
+NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
+MOST_PASSES = 4  # each reduces the error of the known effects by their share of the reading, at most a hundredth
+SETTLED = 1e-6  # change of bias, g or deg/s, and matrix in a pass: the known effects change by a hundredth of it
+Change: TypeAlias = Literal["readings", "bias", "matrix", "effects"]
 
 
 def known_effects(sensor: str, method: Method) -> tuple[FittedEffect, ...]:
@@ -181,14 +186,6 @@ def without_known_effects(
             filtered = subtracted(filtered, calibration, known)
             found[sensor] = without_known(calibration, known)
     return replace(recordings, filtered=filtered), found
-
-
-GIVEN, GIVEN_SOURCE = "given", "given calibration"
-NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
-
-MOST_PASSES = 4  # each reduces the error of the known effects by their share of the reading, at most a hundredth
-SETTLED = 1e-6  # change of bias, g or deg/s, and matrix in a pass: the known effects change by a hundredth of it
-Change: TypeAlias = Literal["readings", "bias", "matrix", "effects"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -92,6 +92,18 @@ if TYPE_CHECKING:
 
 OWNERS = (Owner.SENSOR, Owner.RECORDING)  # errors of place, table and timing have lines of their own in the budget
 OF_ACCELEROMETER = "accelerometer."  # before an effect of the accelerometer that changes the gyroscope's parameters
+# share of a variance, up to which a part of it may be chance: the lack of fit was 0 to 5 % on a table within its stated
+# accuracies, 18 to 73 % with 0.02 deg between its axes (12 simulated units each, 18 positions)
+CHANCE_VARIANCE_SHARE = 0.1
+DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
+NOISE_SOURCE, QUANTISATION_SOURCE = "noise of the readings", "quantisation"
+NOT_STATED = "one calibration does not show it: calibrate the unit again after switching it off"
+TEMPERATURE = "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is stated"
+ACROSS = (
+    "table_tilt estimates the component across the shaft alone; the one about the shaft is the same as a common zero "
+    "of the turns"
+)
+GRAVITY = "local gravity"
 
 
 def limited_effects(
@@ -217,20 +229,6 @@ def changes_through_gravity(
         df += np.stack([(force @ K.T) @ matrix_of(change).T for change in own.T], axis=2)
         _keep_larger(found, OF_ACCELEROMETER + this.name, np.einsum("pmc,mcq->pq", by_force, df))
     return found
-
-
-# share of a variance, up to which a part of it may be chance: the lack of fit was 0 to 5 % on a table within its stated
-# accuracies, 18 to 73 % with 0.02 deg between its axes (12 simulated units each, 18 positions)
-CHANCE_VARIANCE_SHARE = 0.1
-DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
-NOISE_SOURCE, QUANTISATION_SOURCE = "noise of the readings", "quantisation"
-NOT_STATED = "one calibration does not show it: calibrate the unit again after switching it off"
-TEMPERATURE = "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is stated"
-ACROSS = (
-    "table_tilt estimates the component across the shaft alone; the one about the shaft is the same as a common zero "
-    "of the turns"
-)
-GRAVITY = "local gravity"
 
 
 def effective_degrees_of_freedom(contributions: ArrayLike, degrees_of_freedom: ArrayLike) -> Values:

@@ -51,6 +51,7 @@ MIN_MEDIAN_MOVES = 3  # for a median
 MOST_MOVES = 40  # bounds the cost
 MAX_ROTATION_SAMPLES = 200_000  # bounds the cost
 FITS_DEG, FAILS_DEG = 15.0, 30.0  # the error of any other possible unit is tens of degrees
+STRAIGHT = ("+x", "+y", "+z")
 
 
 @dataclass(frozen=True)
@@ -162,9 +163,6 @@ def declared_scale(table: Log) -> tuple[float, str] | None:
         f"in {len(moves)} moves between rests gravity turns by the angle of the rates if they are multiplied by "
         f"{scales[best]:.4g} ({misfits[best]:.1f} deg error, {misfits[0]:.0f} deg as declared)"
     )
-
-
-STRAIGHT = ("+x", "+y", "+z")
 
 
 def axis_matrix(axis_map: Sequence[str]) -> Values:

@@ -53,6 +53,17 @@ MOST_POINTS = 1 << 18  # bounds memory and the cost of correlation; a power of 2
 BENT_SLOPE_RATIO = 8.0  # times the median change of slope
 RESTING_DPS = 0.5  # smallest range of the rate that is called a motion
 SAME_SIGN = 0.9  # correlation of the logged rate with the slope of the angle
+MIN_SPLINE_ROWS = 6  # for the quintic spline
+SMALLEST_CORRELATION = 0.9  # at most 19 % of the variance of the rates is not explained, 1 - 0.9^2
+BLOCKS_S = (1.0, 4.0)  # about the length of a ramp of the rate, and longer
+COARSE_S = 0.01  # step of the grid of offsets
+MOST_PLACES, WORTH_A_LOOK = 40, 0.3  # offsets refined, and their least correlation relative to the best
+SAMPLES_OF_A_LOOK = 20_000  # bounds the cost of up to 40 offsets
+AMBIGUOUS = 1.1  # ratio of the second-best mean squared residual to the best
+MIN_SHARED_DURATION = 0.5  # share of the shorter log that both must cover
+MAX_CLOCK_STEPS, ROUNDING_S = 20, 1e-9  # Gauss-Newton stops below 1 ns, the resolution of the times
+MIN_CLOCK_BLOCKS = 3.0  # bounds the factor nu / (nu - 2), the variance of Student's t, for few blocks
+RESOLVED = 0.005  # of the table's interval: between its samples the motion is interpolated
 
 
 @dataclass(frozen=True)
@@ -189,19 +200,6 @@ def _bent_line(log_time: Values, value: Values, tau: Values) -> Values:
     meet = (before * h - ahead) * (after * h - ahead) <= 0  # the slope lies between the slopes on either side
     bent = meet & (change[k - 1] > BENT_SLOPE_RATIO * np.median(change)) & (tau >= log_time[1]) & (tau <= log_time[-2])
     return np.where(bent, np.where(before > after, np.minimum(left, right), np.maximum(left, right)), plain)
-
-
-MIN_SPLINE_ROWS = 6  # for the quintic spline
-SMALLEST_CORRELATION = 0.9  # at most 19 % of the variance of the rates is not explained, 1 - 0.9^2
-BLOCKS_S = (1.0, 4.0)  # about the length of a ramp of the rate, and longer
-COARSE_S = 0.01  # step of the grid of offsets
-MOST_PLACES, WORTH_A_LOOK = 40, 0.3  # offsets refined, and their least correlation relative to the best
-SAMPLES_OF_A_LOOK = 20_000  # bounds the cost of up to 40 offsets
-AMBIGUOUS = 1.1  # ratio of the second-best mean squared residual to the best
-MIN_SHARED_DURATION = 0.5  # share of the shorter log that both must cover
-MAX_CLOCK_STEPS, ROUNDING_S = 20, 1e-9  # Gauss-Newton stops below 1 ns, the resolution of the times
-MIN_CLOCK_BLOCKS = 3.0  # bounds the factor nu / (nu - 2), the variance of Student's t, for few blocks
-RESOLVED = 0.005  # of the table's interval: between its samples the motion is interpolated
 
 
 @dataclass(frozen=True)

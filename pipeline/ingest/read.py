@@ -58,6 +58,9 @@ if TYPE_CHECKING:
 
 MAX_NAMED_FILES = 5  # further files that an error lists
 IN_MEMORY = "(DataFrame)"  # after the name of a recording that has no file
+LABEL = "label"
+AVERAGED_S = 1.0  # shorter than anyone averages by hand: the noise is then rather too large
+BETWEEN_ROWS_S = 1.0  # between the rows of a block
 
 
 def read_recordings(
@@ -276,11 +279,6 @@ def _compare_clocks(recordings: list[Recording]) -> list[Recording]:
     overlap = any(start <= end for (_, end), (start, _) in itertools.pairwise(spans))
     apart = overlap or 0 < len(since_1970) < len(recordings)
     return [replace(r, clock_shared=False) for r in recordings] if apart else recordings
-
-
-LABEL = "label"
-AVERAGED_S = 1.0  # shorter than anyone averages by hand: the noise is then rather too large
-BETWEEN_ROWS_S = 1.0  # between the rows of a block
 
 
 def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, checks: Checks) -> Log:

@@ -66,6 +66,8 @@ _STAGE = fields(
     },
     ("name", "parameters"),
 )
+_TEMPERATURES = dict.fromkeys(("temperature_degc", "soaked_degc"), items(number, 2))
+_RANGE = fields({"specific_force_g": number, "angular_rate_dps": number, **_TEMPERATURES}, ())
 
 
 def _sensor(unit: str) -> Check:
@@ -83,8 +85,6 @@ def _sensor(unit: str) -> Check:
     return fields({**required, **optional}, required, others=True)
 
 
-_TEMPERATURES = dict.fromkeys(("temperature_degc", "soaked_degc"), items(number, 2))
-_RANGE = fields({"specific_force_g": number, "angular_rate_dps": number, **_TEMPERATURES}, ())
 _DOCUMENT = fields(
     {
         "status": one_of("ok"),

@@ -31,6 +31,27 @@ if TYPE_CHECKING:
 
 # above every shipped formula; they bound the cost
 MAX_FORMULA_LENGTH, MAX_FORMULA_DEPTH, MAX_FORMULA_NODES, LARGEST_POWER = 500, 40, 200, 20.0
+MOVING = ("angular_rate", "angular_acceleration", "direction", "rate")
+_LIBRARY_FUNCTIONS = (np.sin, np.cos, np.tan, np.tanh, np.exp, np.log, np.sqrt)
+OPERATORS: dict[type[ast.operator], tuple[Callable[..., Any], str]] = {
+    ast.Add: (np.add, "+"),
+    ast.Sub: (np.subtract, "-"),
+    ast.Mult: (np.multiply, "*"),
+    ast.Div: (np.divide, "/"),
+}
+POWER_FUNCTIONS: dict[float, tuple[Callable[..., Any], str, str]] = {  # in C of a name, and of what is longer
+    2.0: (np.square, "({0} * {0})", "imu_square({0})"),
+    3.0: (lambda x: x * x * x, "({0} * {0} * {0})", "imu_cube({0})"),
+}
+IN_C_ONCE = {f"(m->temperature - (imu_real){25.0!r})": "dt"}  # calibration.h has a name for it
+SIMPLE_IN_C = re.compile(r"[\w\[\]{}>-]+")  # a name: to evaluate it twice costs nothing
+STRANGE = re.compile(r"[^A-Za-z0-9_ .+\-*/(),]")
+HINTS = {
+    "^": "; write ** for a power",
+    "=": "; a formula has no names of its own",
+    "<": "; use step(x) or band(x, low, high)",
+    ">": "; use step(x) or band(x, low, high)",
+}
 
 
 class Signal(NamedTuple):
@@ -70,7 +91,6 @@ SIGNALS = {
         for j, b in enumerate("xyz")
     },
 }
-MOVING = ("angular_rate", "angular_acceleration", "direction", "rate")
 OF_THE_MOTION = {name for name, signal in SIGNALS.items() if signal.field in MOVING}  # 0 while nothing moves
 
 
@@ -82,7 +102,6 @@ class Function(NamedTuple):
     c: str
 
 
-_LIBRARY_FUNCTIONS = (np.sin, np.cos, np.tan, np.tanh, np.exp, np.log, np.sqrt)
 FUNCTIONS: dict[str, Function] = {
     **{f.__name__: Function(1, f, f"(imu_real){f.__name__}({{}})") for f in _LIBRARY_FUNCTIONS},
     "sign": Function(1, np.sign, "(imu_real)imu_sign({})"),
@@ -96,25 +115,6 @@ FUNCTIONS: dict[str, Function] = {
         lambda x, low, high: np.where(np.isnan(x), x, np.logical_and(x >= low, x <= high)),
         "(imu_real)imu_band({}, {}, {})",
     ),
-}
-OPERATORS: dict[type[ast.operator], tuple[Callable[..., Any], str]] = {
-    ast.Add: (np.add, "+"),
-    ast.Sub: (np.subtract, "-"),
-    ast.Mult: (np.multiply, "*"),
-    ast.Div: (np.divide, "/"),
-}
-POWER_FUNCTIONS: dict[float, tuple[Callable[..., Any], str, str]] = {  # in C of a name, and of what is longer
-    2.0: (np.square, "({0} * {0})", "imu_square({0})"),
-    3.0: (lambda x: x * x * x, "({0} * {0} * {0})", "imu_cube({0})"),
-}
-IN_C_ONCE = {f"(m->temperature - (imu_real){25.0!r})": "dt"}  # calibration.h has a name for it
-SIMPLE_IN_C = re.compile(r"[\w\[\]{}>-]+")  # a name: to evaluate it twice costs nothing
-STRANGE = re.compile(r"[^A-Za-z0-9_ .+\-*/(),]")
-HINTS = {
-    "^": "; write ** for a power",
-    "=": "; a formula has no names of its own",
-    "<": "; use step(x) or band(x, low, high)",
-    ">": "; use step(x) or band(x, low, high)",
 }
 
 

@@ -72,6 +72,12 @@ MAX_DIFFERENT_MOVES = 10  # of a step: as many different changes are not those o
 CLEARLY_ABOVE = 4.0  # times the step of an exact log: its angles may all be even multiples
 MEMORY_S = 0.3  # fifteen time constants of the slowest filter of 20 ms
 CORNER_DPS2 = 3.0  # over a filter of 20 ms: 0.06 deg/s
+EARTH_RATE_DPS = 360.0 / 86164.0905  # a sidereal day, s
+UP_AT_ZERO = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # see above
+# Rows: level x, y, z axes in the body frame at table angle 0, for turns about x, y, z.
+LEVEL_AT_ZERO = np.array([np.eye(3), np.eye(3), [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]])
+ABOUT = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)  # ABOUT[a] @ u = e_a x u
+NODES, WEIGHTS = np.polynomial.laguerre.laggauss(4)  # of integrals of exp(-x) u(x), for the lag of smooth signals
 
 
 class EncoderTrajectory:
@@ -263,14 +269,6 @@ def nearest_slope(time: Values, values: Values) -> Values:
         # derivative at 0 of (x - a) (x - b) (x - c) (x - d): the sum of the products of three factors
         slope -= v[j] * (a * b * (c + d) + c * d * (a + b)) / spread
     return slope
-
-
-EARTH_RATE_DPS = 360.0 / 86164.0905  # a sidereal day, s
-UP_AT_ZERO = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # see above
-# Rows: level x, y, z axes in the body frame at table angle 0, for turns about x, y, z.
-LEVEL_AT_ZERO = np.array([np.eye(3), np.eye(3), [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]])
-ABOUT = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)  # ABOUT[a] @ u = e_a x u
-NODES, WEIGHTS = np.polynomial.laguerre.laggauss(4)  # of integrals of exp(-x) u(x), for the lag of smooth signals
 
 
 def earth_rate(latitude_deg: float, azimuth_deg: float) -> Values:

@@ -54,6 +54,18 @@ if TYPE_CHECKING:
 MAX_INVERSION_ITERATIONS = 60  # two digits a round: far more than 1e-13 needs
 INVERSION_TOLERANCE = 1e-13  # relative: some hundred roundings of a double
 OUT_OF_REACH = 1e12  # g or deg/s: far beyond any reading, the fixed point diverges
+STRETCH = 4.0  # memories: exp(4) costs two digits of the sums; shorter stretches cost time
+MAX_MEMORIES_BACK = 50.0  # memories that time may go back: exp(50) of the sums is still far from overflow
+DEGENERATE = 1e-15  # determinant over its scale, below which doubles do not resolve a slope
+FIELDS_OF_SIGNALS = {
+    "time": {"time"},
+    "temperature": {"temperature"},
+    "specific_force": {"accelerometer"},
+    "specific_force_rate": {"accelerometer", "time"},
+    "angular_rate": {"gyroscope"},
+    "angular_acceleration": {"gyroscope", "time"},
+    "direction": {"gyroscope"},
+}
 
 
 @dataclass(frozen=True)
@@ -167,20 +179,6 @@ def _near(new: Values, old: Values) -> Mask:
     """Return which samples have converged, relative to their size; missing ones (NaN) count as such: (n,) array."""
     far = np.abs(new - old) > INVERSION_TOLERANCE * np.maximum(np.abs(new), 1.0)
     return np.logical_not(far[:, 0] | far[:, 1] | far[:, 2])
-
-
-STRETCH = 4.0  # memories: exp(4) costs two digits of the sums; shorter stretches cost time
-MAX_MEMORIES_BACK = 50.0  # memories that time may go back: exp(50) of the sums is still far from overflow
-DEGENERATE = 1e-15  # determinant over its scale, below which doubles do not resolve a slope
-FIELDS_OF_SIGNALS = {
-    "time": {"time"},
-    "temperature": {"temperature"},
-    "specific_force": {"accelerometer"},
-    "specific_force_rate": {"accelerometer", "time"},
-    "angular_rate": {"gyroscope"},
-    "angular_acceleration": {"gyroscope", "time"},
-    "direction": {"gyroscope"},
-}
 
 
 @dataclass(frozen=True)

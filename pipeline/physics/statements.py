@@ -75,6 +75,35 @@ LEFT_OUT_REASONS = {
     "N-SHAKEN": "shaken at rest",
     "N-MOVED": "moving",
 }  # notes on rows that no fit uses, and the reason
+MULTIPLE = 4.0  # see above
+LOW_COST_BIAS = {"accelerometer": 0.08 / 2.0, "gyroscope": 20.0 / 250.0}  # share of the range, see above
+LOW_COST_SCALE, LOW_COST_CROSS = 0.03, 0.02  # see above
+EQUAL_SPREAD = 0.1  # relative spread of the three scale factors that have one cause
+FACTOR_DISTANCE = 0.03  # relative distance from a factor by which it is recognised, as a low-cost scale factor's limit
+MISTAKEN_FACTORS = {
+    "accelerometer": {
+        9.80665: "in m/s^2, and read as g",
+        1000.0: "in mg, and read as g",
+        1.0 / 9.80665: "in g, and read as m/s^2",
+    },
+    "gyroscope": {
+        np.pi / 180.0: "in rad/s, and read as deg/s",
+        180.0 / np.pi: "in deg/s, and read as rad/s",
+        1000.0: "in mdeg/s, and read as deg/s",
+        1.0 / 6.0: "in revolutions a minute, and read as deg/s",
+    },
+}
+NAMED_PARAMETERS = 5  # parameters beyond the limits that a line names
+RANGE_RATIOS = [2.0**n for n in range(-6, 7) if n]  # ratios of the ranges of one sensor: neighbours differ by two
+CAUSES_OF_BIAS = "an offset of raw counts that is not subtracted, another column, or a damaged axis"
+OF_CROSS_AXIS = "another column or axis map, or a unit that moved on the table between recordings"
+OF_FRAME = "the angles between the calibrated axes and the case"
+NO_FRAME = "how the case lies to turn axes, faces and zeros is not stated (table.seat_deg, procedure.faces)"
+OF_EFFECT = "another effect that looks alike, or an error of the table, its log or the time stamps"
+Entry = dict[str, Any]
+LimitRow = tuple[
+    str, float, float, str, float, float, str
+]  # name, value, uncertainty, unit, limit, floor, likely cause
 
 
 def with_open(
@@ -167,38 +196,6 @@ def open_words(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     names = [entry["effect"].replace("_", " ").replace(".", ": ") for entry in part["open"]]
     source = f"{', '.join(shortened(names, NAMED_EFFECTS))}{WITH_THEM}{', of the '.join(figures)})"
     return [(source, "these recordings leave them open, and U is valid if they are absent")]
-
-
-MULTIPLE = 4.0  # see above
-LOW_COST_BIAS = {"accelerometer": 0.08 / 2.0, "gyroscope": 20.0 / 250.0}  # share of the range, see above
-LOW_COST_SCALE, LOW_COST_CROSS = 0.03, 0.02  # see above
-EQUAL_SPREAD = 0.1  # relative spread of the three scale factors that have one cause
-FACTOR_DISTANCE = 0.03  # relative distance from a factor by which it is recognised, as a low-cost scale factor's limit
-MISTAKEN_FACTORS = {
-    "accelerometer": {
-        9.80665: "in m/s^2, and read as g",
-        1000.0: "in mg, and read as g",
-        1.0 / 9.80665: "in g, and read as m/s^2",
-    },
-    "gyroscope": {
-        np.pi / 180.0: "in rad/s, and read as deg/s",
-        180.0 / np.pi: "in deg/s, and read as rad/s",
-        1000.0: "in mdeg/s, and read as deg/s",
-        1.0 / 6.0: "in revolutions a minute, and read as deg/s",
-    },
-}
-NAMED_PARAMETERS = 5  # parameters beyond the limits that a line names
-RANGE_RATIOS = [2.0**n for n in range(-6, 7) if n]  # ratios of the ranges of one sensor: neighbours differ by two
-CAUSES_OF_BIAS = "an offset of raw counts that is not subtracted, another column, or a damaged axis"
-OF_CROSS_AXIS = "another column or axis map, or a unit that moved on the table between recordings"
-OF_FRAME = "the angles between the calibrated axes and the case"
-NO_FRAME = "how the case lies to turn axes, faces and zeros is not stated (table.seat_deg, procedure.faces)"
-OF_EFFECT = "another effect that looks alike, or an error of the table, its log or the time stamps"
-
-Entry = dict[str, Any]
-LimitRow = tuple[
-    str, float, float, str, float, float, str
-]  # name, value, uncertainty, unit, limit, floor, likely cause
 
 
 def implausible(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[Entry]:

@@ -70,6 +70,15 @@ if TYPE_CHECKING:
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
 NANOSECONDS = 1_000_000_000  # in a second
 ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3  # of CSV files: rounding far below any noise
+MARGIN_S = 2.0  # by which a separate log begins earlier and ends later than the recording
+LARGEST_OFFSET_S, DRIFT_PPM = 100.0, 50.0  # of a random clock; the drift is the standard deviation of quartz clocks
+NO_TABLE: dict[str, Any] = {"table_angle": None, "table_rate": None, "table_attitude": None}
+INGEST = "table_log"  # configs/ingest that reads a separate log
+COMMENT = "# The table has no encoders: its program instead of its log. Written by python -m pipeline simulate.\n"
+UNITS_CSV_COLUMNS = (
+    "unit", "serial", "lot", "date", "sensor", "table", "procedure", "method", "ingest", "filter", "overrides",
+)  # fmt: skip
+CAMPAIGN_YAML = "# Hydra overrides for all units of this campaign.\noverrides: []\n"
 
 
 class Streams:
@@ -238,13 +247,6 @@ def received(count: int, lost: float, rng: np.random.Generator) -> NDArray[np.bo
     return kept
 
 
-MARGIN_S = 2.0  # by which a separate log begins earlier and ends later than the recording
-LARGEST_OFFSET_S, DRIFT_PPM = 100.0, 50.0  # of a random clock; the drift is the standard deviation of quartz clocks
-NO_TABLE: dict[str, Any] = {"table_angle": None, "table_rate": None, "table_attitude": None}
-INGEST = "table_log"  # configs/ingest that reads a separate log
-COMMENT = "# The table has no encoders: its program instead of its log. Written by python -m pipeline simulate.\n"
-
-
 def with_table_log(
     unit: UnitDescription, planned: Sequence[Planned], recordings: list[Recording], rng: np.random.Generator
 ) -> tuple[list[Recording], dict[str, float] | None]:
@@ -364,12 +366,6 @@ def _procedure_text(name: str, course: Course) -> str:
         if isinstance(planned.trajectory, CommandedTurns) and planned.name in entries:
             entries[planned.name]["program"] = [s.json_value for s in as_program(planned.trajectory.program)]
     return COMMENT + yaml.safe_dump({**procedure, "recordings": entries}, sort_keys=False, width=120)
-
-
-UNITS_CSV_COLUMNS = (
-    "unit", "serial", "lot", "date", "sensor", "table", "procedure", "method", "ingest", "filter", "overrides",
-)  # fmt: skip
-CAMPAIGN_YAML = "# Hydra overrides for all units of this campaign.\noverrides: []\n"
 
 
 def write_campaign(

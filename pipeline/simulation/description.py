@@ -77,6 +77,12 @@ TABLE_PROCEDURES = ("three_axis_turns", "thermal_ramp", ONE_RECORDING)
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 STEPS_DEG = (1.0, 2.0, 3.0, 5.0, 10.0, 15.0, 30.0, 45.0, 90.0)  # divisors of a turn
+FORMATS = ("csv", "mcap")
+DESCRIPTION_KINDS = ("rows", "file", "program")
+_, BY_FILE, BY_PROGRAM = DESCRIPTION_KINDS
+UNITS_OF_A_LOT = 25  # for units that are described by a count: a round number
+SAMPLING_BY_HAND_S = 0.1  # docs/record.md: 10 Hz or more, to find rests
+RECORDED = ("sensor", "table", "procedure", "samples", "interval_s", "lost")
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -287,16 +293,10 @@ def _faces_and_turns(course: Course, rng: np.random.Generator, accuracy: float) 
     return RestsAndMoves(Program(steps), np.array(axes), start)
 
 
-FORMATS = ("csv", "mcap")
-DESCRIPTION_KINDS = ("rows", "file", "program")
-_, BY_FILE, BY_PROGRAM = DESCRIPTION_KINDS
-UNITS_OF_A_LOT = 25  # for units that are described by a count: a round number
-SAMPLING_BY_HAND_S = 0.1  # docs/record.md: 10 Hz or more, to find rests
 # By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
 COURSE_BY_HAND = Course(dwell_s=REST_BY_HAND_S, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
 # Each turn there and back, the second held out between rests of 4 s or longer; 360 deg in some 3 s.
 FACES_AND_TURNS = replace(COURSE_BY_HAND, dwell_s=5.0, rates_dps=(120.0,), both_directions=True)
-RECORDED = ("sensor", "table", "procedure", "samples", "interval_s", "lost")
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

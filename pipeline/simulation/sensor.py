@@ -75,6 +75,9 @@ PANELS = np.concatenate([np.linspace(0.0, 2.0, 21), np.linspace(2.25, 6.0, 16), 
 MIDDLE, HALF = (PANELS[1:] + PANELS[:-1]) / 2.0, np.diff(PANELS) / 2.0
 NODES = np.concatenate([MIDDLE - HALF / np.sqrt(3.0), MIDDLE + HALF / np.sqrt(3.0)])
 LAG_RULE = NODES, np.tile(HALF, 2) * np.exp(-NODES) / np.sum(np.tile(HALF, 2) * np.exp(-NODES))
+SENSOR_KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
+NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # they replace figures of the sensor file
+POSITIVE = {"time_constant", "tau"}  # parameters without a sign
 
 
 @dataclass(frozen=True)
@@ -178,11 +181,6 @@ def alter(scene: Scene, effects: Mapping[str, Values]) -> Scene:
     for name in [name for name in effects if name in ALTERATIONS]:
         scene = ALTERATIONS[name](scene, effects[name])
     return scene
-
-
-SENSOR_KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
-NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # they replace figures of the sensor file
-POSITIVE = {"time_constant", "tau"}  # parameters without a sign
 
 
 @dataclass(frozen=True)

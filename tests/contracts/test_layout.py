@@ -86,3 +86,19 @@ def test_the_rooms_have_a_face_that_says_what_they_do() -> None:
         text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8")))
         assert text, folder
         assert text.splitlines()[0].endswith("."), folder
+
+
+def test_constants_stand_before_functions_and_classes() -> None:
+    """Except for those that use a class or a function of their module."""
+    late = []
+    for module, file in modules().items():
+        body, defined = ast.parse(file.read_text(encoding="utf-8")).body, set()
+        for node in body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                defined.add(node.name)
+            elif isinstance(node, ast.Assign | ast.AnnAssign) and defined and module.startswith("pipeline"):
+                names = {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+                targets = {each.id for each in ast.walk(node) if isinstance(each, ast.Name) and each.id not in defined}
+                late += [] if names & defined else [f"{module}:{node.lineno}"]
+                defined |= targets if names & defined else set()
+    assert late == []

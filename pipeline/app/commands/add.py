@@ -39,6 +39,21 @@ if TYPE_CHECKING:
 
 
 OVERRIDES_KEY = "overrides"
+EPILOG = """\
+Added effects are part of the model of the unit in every run, until they are removed. The run repeats the stages that
+depend on them, and its last lines state the change of the held-out error.
+
+examples:
+  python -m pipeline add demo mpu6050-2-hidden gyroscope.g_sensitivity
+  python -m pipeline add my_bench U1 gyroscope.g_sensitivity accelerometer.lever_arm --no-run
+  python -m pipeline add my_fleet --missing                 to each unit, the effects that its diagnosis found missing
+  python -m pipeline add my_fleet --missing g_sensitivity   only this effect, in the units where it is missing
+  python -m pipeline add my_bench U1 --suggested            the formula that the diagnosis suggests, as effects/*.yaml
+  python -m pipeline remove demo mpu6050-2-hidden gyroscope.g_sensitivity
+
+Effects in units.csv or on the command line override the file. The command is then refused, and the message names the
+place to edit.
+"""
 
 
 class Edit(NamedTuple):
@@ -220,23 +235,6 @@ def _value(layers: Sequence[Layer], key: str) -> list[str]:
             )
         effects = [str(v) for v in value]
     return effects
-
-
-EPILOG = """\
-Added effects are part of the model of the unit in every run, until they are removed. The run repeats the stages that
-depend on them, and its last lines state the change of the held-out error.
-
-examples:
-  python -m pipeline add demo mpu6050-2-hidden gyroscope.g_sensitivity
-  python -m pipeline add my_bench U1 gyroscope.g_sensitivity accelerometer.lever_arm --no-run
-  python -m pipeline add my_fleet --missing                 to each unit, the effects that its diagnosis found missing
-  python -m pipeline add my_fleet --missing g_sensitivity   only this effect, in the units where it is missing
-  python -m pipeline add my_bench U1 --suggested            the formula that the diagnosis suggests, as effects/*.yaml
-  python -m pipeline remove demo mpu6050-2-hidden gyroscope.g_sensitivity
-
-Effects in units.csv or on the command line override the file. The command is then refused, and the message names the
-place to edit.
-"""
 
 
 def main(argv: Sequence[str]) -> int:

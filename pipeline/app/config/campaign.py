@@ -53,6 +53,9 @@ if TYPE_CHECKING:
 
 TAKE_OVER = "take_over"
 SMALLEST_BATCH, LARGEST_BATCH = 25, 160  # units: a job takes some seconds, as its start does; a minute, to fill cores
+COMPARISON_KEYS = ("title", "units", "groups", "by", "where", "pairs", "against", "x", "sensors")
+TABLE_TIME = "table_time"
+COMPARISON_FORM = "a list of units, or a mapping with units, groups or by"
 
 
 @dataclass(frozen=True)
@@ -252,11 +255,6 @@ def boards_of(units: Mapping[str, UnitRow]) -> dict[str, list[str]]:
         if unit.row.get("board"):
             boards.setdefault(unit.row["board"], []).append(name)
     return {board: chips for board, chips in boards.items() if len(chips) > 1}
-
-
-COMPARISON_KEYS = ("title", "units", "groups", "by", "where", "pairs", "against", "x", "sensors")
-TABLE_TIME = "table_time"
-COMPARISON_FORM = "a list of units, or a mapping with units, groups or by"
 
 
 def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], file: str) -> list[JSON]:

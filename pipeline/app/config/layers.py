@@ -54,6 +54,20 @@ CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")  # all except tab and 
 KNOWN_COLUMNS = ("unit", "overrides", *GROUPS, "serial", "lot", "date", "board")
 SIMILARITY = 0.85  # of a misspelt name: overide 0.88, procedur 0.94; but material and serial: 0.71
 MAX_SHEET_BYTES = 100_000_000  # a million units of 100 characters each
+DEVICES_FOLDER = "devices"
+BETWEEN_OVERRIDES = re.compile(r';(?=(?:[^"]*"[^"]*")*[^"]*$)')  # a semicolon outside double quotes
+SIMULATION = "simulation.yaml"
+LIST = "a list of overrides KEY=VALUE"
+Overrides = Annotated[
+    list[str],
+    BeforeValidator(lambda value: [value] if isinstance(value, str) else value or []),
+    Field(description=LIST),
+]
+ByName = Annotated[
+    dict[Annotated[str, BeforeValidator(str)], Overrides],
+    BeforeValidator(lambda value: value or {}),
+    Field(description="a mapping of names to lists of overrides"),
+]
 
 
 class UnitsTable(NamedTuple):
@@ -139,22 +153,6 @@ def _misspelt(columns: list[str]) -> list[str]:
             hint = f"nearest: {near[0]}; correct it, or rename a column of your own"
             problems.append(f"line 1: column {column!r} is not known; {hint}")
     return problems
-
-
-DEVICES_FOLDER = "devices"
-BETWEEN_OVERRIDES = re.compile(r';(?=(?:[^"]*"[^"]*")*[^"]*$)')  # a semicolon outside double quotes
-SIMULATION = "simulation.yaml"
-LIST = "a list of overrides KEY=VALUE"
-Overrides = Annotated[
-    list[str],
-    BeforeValidator(lambda value: [value] if isinstance(value, str) else value or []),
-    Field(description=LIST),
-]
-ByName = Annotated[
-    dict[Annotated[str, BeforeValidator(str)], Overrides],
-    BeforeValidator(lambda value: value or {}),
-    Field(description="a mapping of names to lists of overrides"),
-]
 
 
 class DeviceFile(BaseModel):

@@ -46,6 +46,13 @@ NOT_TEXTS = ("null", "true", "false", "nan", "inf")
 REFERENCE_TOKEN = re.compile(r"(\\\$\{)|\$\{\s*([A-Za-z_]\w*(?:\.\w+)+)\s*\}|\$\{")
 MAX_REFERENCE_LENGTH = 10_000  # characters of a value with references, such as a name or a unit
 REFERENCE_FORM = "a reference is ${group.key}, for example ${sensor.accelerometer.counts_per_unit}"
+PYTHON = "python_effects"
+GIVEN = "given"  # name of the method
+BUILT_IN = r"(?m)^built_in: true"  # marks an effect of the package
+ONLY_FROM_THE_COMMAND_LINE = (
+    "an effect in Python is code, and is loaded only where the command line names it: "
+    "--config 'python_effects=[path/to/my_effect.py]', or the argument python_effects of a Python function"
+)
 
 
 class SettingProblem(Exception):  # noqa: N818  (problems are collected, then raised as one ConfigurationError)
@@ -181,15 +188,6 @@ def _value_of(name: str, root: dict[str, Any], text: str) -> Any:  # noqa: ANN40
     if any(isinstance(v, (dict, list)) or (isinstance(v, str) and "${" in v) for v in values):
         raise ConfigurationError(f"{text[:200]!r}: {name} is a group of settings or a reference; name one value")
     return value
-
-
-PYTHON = "python_effects"
-GIVEN = "given"  # name of the method
-BUILT_IN = r"(?m)^built_in: true"  # marks an effect of the package
-ONLY_FROM_THE_COMMAND_LINE = (
-    "an effect in Python is code, and is loaded only where the command line names it: "
-    "--config 'python_effects=[path/to/my_effect.py]', or the argument python_effects of a Python function"
-)
 
 
 @dataclass(frozen=True)

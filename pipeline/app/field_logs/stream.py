@@ -53,6 +53,9 @@ USED = ("time", "temperature", *ACCELEROMETER, *GYROSCOPE)
 CANONICAL_CSV = Ingest(
     name="canonical_csv", csv={"columns": {c: {"column": CANONICAL[c], "unit": next(iter(UNITS[c]))} for c in USED}}
 )
+EXTRAPOLATED = "extrapolated"  # 1 where a row is beyond the soaked temperatures, else 0
+BLOCK_ROWS = 20_000  # of a message log, like a block of a text log
+CHANNELS_OF_SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
 
 
 @dataclass(frozen=True)
@@ -219,11 +222,6 @@ def user_errors(target: Path) -> Iterator[None]:
         raise InputError("the output was closed before it was complete", str(target)) from None
     except OSError as error:
         raise InputError(f"the output cannot be written: {error.strerror}", str(target)) from None
-
-
-EXTRAPOLATED = "extrapolated"  # 1 where a row is beyond the soaked temperatures, else 0
-BLOCK_ROWS = 20_000  # of a message log, like a block of a text log
-CHANNELS_OF_SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
 
 
 class CsvLog:

@@ -76,6 +76,8 @@ MIN_RESTS = 9  # rests of the fit, one for each parameter
 SAME_DIRECTION = 0.08
 LEVEL_DEG = 3.0  # largest tilt that is not mentioned: units are set down by hand to about 1 deg
 BETWEEN_SIDES = np.tan(np.radians(22.5))  # ratio of two components above which a corner is raised, not a side
+TURNS_DEG = (90.0, 180.0, 270.0, 360.0)  # angles that need no scale
+RELATIVE_STEP = 1e-5  # relative, of a difference quotient: its error is 1e-10
 
 
 @cache
@@ -318,10 +320,6 @@ def _planned(progress: GuideProgress, X: Values, goal: float) -> tuple[list[int]
         if progress.used + len(planned) > MIN_RESTS and progress.largest(F, len(planned)) <= goal:
             break
     return planned, F
-
-
-TURNS_DEG = (90.0, 180.0, 270.0, 360.0)  # angles that need no scale
-RELATIVE_STEP = 1e-5  # relative, of a difference quotient: its error is 1e-10
 
 
 @dataclass(frozen=True)

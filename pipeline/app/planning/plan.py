@@ -64,6 +64,15 @@ ROOM: dict[str, Any] = {
 }  # fmt: skip
 FAULTLESS: dict[str, Any] = {"angle_accuracy_deg": 0.0, "rate_error": [0.0] * 3, "direction_deg": np.zeros((3, 2))}
 Document = dict[str, Any]
+FASTER_DPS = (100.0, 200.0)  # proposed rates, within a low-cost range of 250 deg/s
+CLEARLY_FASTER = 1.3  # least proposed rate over the procedure's fastest rate
+USABLE_RANGE_SHARE = 0.9  # of the gyroscope's full scale: its bias needs the remainder
+MOTION_S, MOTION_DPS = 120.0, 100.0  # of the proposed random motion
+UPRIGHT_DPS = 60.0  # one turn about an upright z in 6 s
+LONG_REST_S = 600.0  # six correlation times of a typical wander (configs/sensor)
+POSITIONS = 2  # proposed number of rests over that of the procedure
+CLEARLY_SMALLER = 99.5  # per cent
+PRINTED_CHANGES = 3  # changes that are printed
 
 
 def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: bool = False) -> Document:
@@ -311,17 +320,6 @@ def _compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[list[
         both = name in a and name in b
         rows.append([*cells, f"{b[name]['smallest'] / a[name]['smallest']:.2f}" if both else ""])
     return [["effect", "smallest in A", "of limit", "smallest in B", "of limit", "B / A"], *rows] if rows else []
-
-
-FASTER_DPS = (100.0, 200.0)  # proposed rates, within a low-cost range of 250 deg/s
-CLEARLY_FASTER = 1.3  # least proposed rate over the procedure's fastest rate
-USABLE_RANGE_SHARE = 0.9  # of the gyroscope's full scale: its bias needs the remainder
-MOTION_S, MOTION_DPS = 120.0, 100.0  # of the proposed random motion
-UPRIGHT_DPS = 60.0  # one turn about an upright z in 6 s
-LONG_REST_S = 600.0  # six correlation times of a typical wander (configs/sensor)
-POSITIONS = 2  # proposed number of rests over that of the procedure
-CLEARLY_SMALLER = 99.5  # per cent
-PRINTED_CHANGES = 3  # changes that are printed
 
 
 @dataclass(frozen=True)

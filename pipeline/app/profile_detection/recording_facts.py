@@ -70,6 +70,14 @@ MAX_LISTED_FIELDS = 24  # of a message that are listed
 MOST_TOPICS = 20  # with a line each
 
 Line = tuple[str, str]
+RESTING_SHARE = 0.8  # share of a recording that lies still
+SAME_ATTITUDE_DEG = 5.0
+SWEPT_DEGC = 10.0  # as of a sweep that validation shows
+MIN_PROPOSED_TURN_DEG = 45.0
+WHOLE, ROUND_DEG = 0.05, 1.0  # relative: a scale factor error of 3 %, and a hand; of an angle that is proposed
+SMOOTHED_S = 0.2
+CLEARER = 0.25  # of the sum of squares, below which another map of axes is proposed
+NO_RATE = np.zeros(3)
 
 
 def facts(recording: Recording, sensor: Sensor | None = None) -> list[Line]:
@@ -369,16 +377,6 @@ def _numbers(value: Any, path: str) -> Iterator[str]:  # noqa: ANN401  (a messag
         children = getattr(value, "__dict__", {})
     for name, child in children.items():
         yield from _numbers(child, f"{path}.{name}" if path else name)
-
-
-RESTING_SHARE = 0.8  # share of a recording that lies still
-SAME_ATTITUDE_DEG = 5.0
-SWEPT_DEGC = 10.0  # as of a sweep that validation shows
-MIN_PROPOSED_TURN_DEG = 45.0
-WHOLE, ROUND_DEG = 0.05, 1.0  # relative: a scale factor error of 3 %, and a hand; of an angle that is proposed
-SMOOTHED_S = 0.2
-CLEARER = 0.25  # of the sum of squares, below which another map of axes is proposed
-NO_RATE = np.zeros(3)
 
 
 def proposed_sheet(folder: Path, settings: Settings) -> str:

@@ -58,6 +58,8 @@ if TYPE_CHECKING:
 
 NORMAL_FACTOR = float(coverage_factor(np.inf))
 FACES_ABOUT, TURNS_ABOUT = 4, 2  # faces, and axes of turns, that show a rotation about one axis
+MOVE = "record turns of 100 deg/s and more about all axes"
+LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
 
 
 def frame_uncertainty(
@@ -85,10 +87,6 @@ def frame_uncertainty(
 def _mountings(recordings: Sequence[Recording], sensor: str) -> int:
     """Return the number of mountings in the turns of a sensor: its setups, or recordings without one."""
     return max(len({r.setup or r.name for r in recordings if r.role == sensor and r.axis is not None}), 1)
-
-
-MOVE = "record turns of 100 deg/s and more about all axes"
-LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
 
 
 def calibration_document(  # noqa: PLR0917  (what a calibration is composed of)

@@ -30,6 +30,16 @@ BASE_COUNT = len(BASE_NAMES)
 BASE, AFTER_BASE = slice(0, BASE_COUNT), slice(BASE_COUNT, None)
 BIAS, MATRIX = slice(0, len(BIAS_NAMES)), slice(len(BIAS_NAMES), BASE_COUNT)
 MATRIX_ROWS = tuple(slice(start, start + len(AXES)) for start in range(MATRIX.start, MATRIX.stop, len(AXES)))
+NORMAL, RECTANGULAR = "normal", "rectangular"
+LIMIT = "not determined by the recordings: limit of the sensor file"  # a source of the uncertainty budget
+LACK_OF_FIT = "lack of fit"  # a part of the noise of the readings
+PART_NAMES = {
+    "white": "white noise",
+    "wander": "bias wander",
+    "lack_of_fit": LACK_OF_FIT,
+    "wander_and_scatter": "bias wander and scatter of the rests",
+}
+MONTE_CARLO = "monte_carlo"  # key of the run in a published budget
 
 
 def base_units(sensor: str) -> tuple[str, ...]:
@@ -123,18 +133,6 @@ class Parameters:
             self.covariance[np.ix_(at, at)],
             self.degrees_of_freedom[at],
         )
-
-
-NORMAL, RECTANGULAR = "normal", "rectangular"
-LIMIT = "not determined by the recordings: limit of the sensor file"  # a source of the uncertainty budget
-LACK_OF_FIT = "lack of fit"  # a part of the noise of the readings
-PART_NAMES = {
-    "white": "white noise",
-    "wander": "bias wander",
-    "lack_of_fit": LACK_OF_FIT,
-    "wander_and_scatter": "bias wander and scatter of the rests",
-}
-MONTE_CARLO = "monte_carlo"  # key of the run in a published budget
 
 
 @dataclass(frozen=True)

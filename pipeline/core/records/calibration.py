@@ -51,6 +51,9 @@ if TYPE_CHECKING:
 
 STEP_KINDS = "subtract, matrix, two_sided"
 COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, times a factor for sums over many residuals
+SCHEMA_VERSION = 2  # of published documents; the keys of each version are in pipeline/schemas
+PRODUCT = 0.1  # of a limit: the largest change of one parameter by the limit of others
+READABLE_VERSIONS = (1, 2)  # a key that a document of version 1 lacks counts as null
 
 
 @dataclass(frozen=True)
@@ -131,11 +134,6 @@ def corrected(steps: Sequence[CorrectionStep], readings: Values) -> Values:
     for step in steps:
         out = step.apply(out)
     return out
-
-
-SCHEMA_VERSION = 2  # of published documents; the keys of each version are in pipeline/schemas
-PRODUCT = 0.1  # of a limit: the largest change of one parameter by the limit of others
-READABLE_VERSIONS = (1, 2)  # a key that a document of version 1 lacks counts as null
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from pipeline.core.verdicts import Verdict
 
 
+FEWEST_MOVES = 6  # held-out moves whose mean error counts; of fewer, the error weighted by its covariance
+KEYS_AS_THEY_ARE = (
+    "unit", "held_out", "reason", "samples", "noise_floor", "vector_noise_floor", "reference_rms", "worse_than_raw",
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class StepErrors:
     """Errors of the magnitude after a step of a calibration, g or deg/s; None where no sample tests it."""
@@ -162,12 +168,6 @@ class SensorValidation:
             limits=tuple(LimitCheck(c["name"], c["limit"], c["value"], c["pass"]) for c in data["limits"]),
             **{key: data[key] for key in KEYS_AS_THEY_ARE},
         )
-
-
-FEWEST_MOVES = 6  # held-out moves whose mean error counts; of fewer, the error weighted by its covariance
-KEYS_AS_THEY_ARE = (
-    "unit", "held_out", "reason", "samples", "noise_floor", "vector_noise_floor", "reference_rms", "worse_than_raw",
-)  # fmt: skip
 
 
 class MovesError(NamedTuple):

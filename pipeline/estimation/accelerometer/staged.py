@@ -82,6 +82,13 @@ SEED = 20190508  # any number
 AS_PRINTED = "the printed variant takes single samples, through which no error of the table can be followed"
 DIFFERENCE_STEP_G = 1e-7  # g, of the differences: truncation and rounding are then both about 1e-8 of the derivative
 ASYMMETRY = "scale_factor_asymmetry"
+GREEK = ("alpha", "beta", "gamma")
+FIT_STAGES = {
+    "orthogonality": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("matrix",)),
+    "misalignment": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("matrix",)),
+    "bias": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("bias",)),
+    "scale_factor": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("matrix", "effects")),
+}
 
 
 def _per_axis(name: str, values: Values, unit: str) -> Quantities:
@@ -94,9 +101,6 @@ def _angles(sides: Mapping[str, Values]) -> Quantities:
         for side, degrees in sides.items()
         for name, angle in zip(GREEK, degrees, strict=True)
     }
-
-
-GREEK = ("alpha", "beta", "gamma")
 
 
 def orthogonality(extremes: Extremes) -> Outcome:
@@ -186,12 +190,6 @@ def scale_factor(extremes: Extremes) -> Outcome:
 
 
 STAGE_EQUATIONS = {f.__name__: f for f in (orthogonality, misalignment, bias, scale_factor)}
-FIT_STAGES = {
-    "orthogonality": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("matrix",)),
-    "misalignment": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("matrix",)),
-    "bias": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("bias",)),
-    "scale_factor": FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("matrix", "effects")),
-}
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,13 @@ if TYPE_CHECKING:
 
 OUTLIER_FALSE_ALARM, FREEDOM = 1e-3, 4.0  # p and v
 ROBUST_ROUNDS, SETTLED_WEIGHT_CHANGE = 6, 0.05  # weights that change by less are final
+NAME = "rests_and_moves"
+FIT_STAGES = {NAME: FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias", "matrix"), free=True)}
+MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg
+# standard uncertainty beyond which an element of the matrix is called undetermined
+MAX_KNOWN_ELEMENT_UNCERTAINTY = 0.05
+CLEARLY_BELOW = 0.9  # of the limit: axes of turns that are known so well, and noise, are less uncertain than it
+RECORDING_ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 
 def fit_robustly(model: GyroscopeModel, fit_model: Callable[..., FitByHand], recordings: Sequence[Recording]) -> Found:
@@ -107,15 +114,6 @@ def _over_noise(model: GyroscopeModel, fitted: FitByHand) -> tuple[Values, Value
     size = np.sqrt(np.sum(r**2 / variance, axis=1))
     scale = float(np.median(size)) / np.sqrt(2.0 * np.log(2.0))
     return size / max(scale, 1e-12), np.linalg.norm(r, axis=1)
-
-
-NAME = "rests_and_moves"
-FIT_STAGES = {NAME: FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias", "matrix"), free=True)}
-MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg
-# standard uncertainty beyond which an element of the matrix is called undetermined
-MAX_KNOWN_ELEMENT_UNCERTAINTY = 0.05
-CLEARLY_BELOW = 0.9  # of the limit: axes of turns that are known so well, and noise, are less uncertain than it
-RECORDING_ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 
 def _limits(data_sheet: DataSheet) -> dict[str, float]:

@@ -62,6 +62,11 @@ if TYPE_CHECKING:
 DIFFERENCE_STEP_DPS = 1e-5
 FORGOTTEN_RATE_CHANGE = 1e-5  # share of a change of rate in a filter's output, below which the filter has settled
 KNOWN_DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alone
+FIT_STAGES = {
+    "bias": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias",)),
+    "orthogonality_and_misalignment": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("matrix",)),
+    "scale_factor": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("matrix",)),
+}
 
 
 def bias(response: Response) -> Outcome:
@@ -108,11 +113,6 @@ def scale_factor(response: Response) -> Outcome:
 
 
 STAGE_EQUATIONS = {f.__name__: f for f in (bias, orthogonality_and_misalignment, scale_factor)}
-FIT_STAGES = {
-    "bias": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias",)),
-    "orthogonality_and_misalignment": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("matrix",)),
-    "scale_factor": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("matrix",)),
-}
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,16 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position.model import State
 
 
+FORCE_ITERATIONS = 12  # of effects that depend on the force
+SETTLED_FORCE_G = 1e-12  # g
+SMALLEST_NOISE = 1e-9  # g
+# Of b and the lower triangle of L.
+PARAMETERS = (
+    "bias_x", "bias_y", "bias_z", "scale_factor_x", "misalignment_yx", "scale_factor_y", "misalignment_zx",
+    "misalignment_zy", "scale_factor_z",
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Soaks:
     """The parts of the soaks of an accelerometer, without the reference of each."""
@@ -118,16 +128,6 @@ def parted(rests: Rests) -> tuple[Rests, Soaks | None]:
     other[chosen] = False
     parts = rests.select(other)
     return rests.select(~other), Soaks(parts, rests.select(chosen), np.searchsorted(names, parts.recording))
-
-
-FORCE_ITERATIONS = 12  # of effects that depend on the force
-SETTLED_FORCE_G = 1e-12  # g
-SMALLEST_NOISE = 1e-9  # g
-# Of b and the lower triangle of L.
-PARAMETERS = (
-    "bias_x", "bias_y", "bias_z", "scale_factor_x", "misalignment_yx", "scale_factor_y", "misalignment_zx",
-    "misalignment_zy", "scale_factor_z",
-)  # fmt: skip
 
 
 class AccelerometerModel:

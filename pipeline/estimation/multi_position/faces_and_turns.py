@@ -51,6 +51,10 @@ if TYPE_CHECKING:
 
 
 BEGUN_DEG = 2.0  # as ``TURN_LIMIT_DEG`` of a rest: a larger turn before the first rest of a recording is motion
+NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip askew in its case, and a hand
+DEPARTS = 4.5  # standard uncertainties: two angles exceed it with a probability of 4e-5
+ONE_LINE = 1.0 - 1e-9  # cosine of the angle between axes that are stated as the same
+FACES = [f"{sign}{axis}" for axis in AXES for sign in "+-"]
 
 
 class StatedTurn(NamedTuple):
@@ -232,12 +236,6 @@ def require_turns(
 
 def _in_words(angle: Values) -> str:
     return "(" + ", ".join(f"{a:.1f}" for a in angle) + ") deg about x, y, z"
-
-
-NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip askew in its case, and a hand
-DEPARTS = 4.5  # standard uncertainties: two angles exceed it with a probability of 4e-5
-ONE_LINE = 1.0 - 1e-9  # cosine of the angle between axes that are stated as the same
-FACES = [f"{sign}{axis}" for axis in AXES for sign in "+-"]
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,18 @@ MIN_NEW_NORM_SHARE = 1e-3
 NEGLIGIBLE_LOG_LIKELIHOOD = 12.0  # of log L below the best: a weight of 6e-6
 PREDICTED_TO = 4.0  # of log L by a linear model: 9 of 10 fits of 13 simulated units differ by less than 0.5
 CEILING_TO = 1.0  # of log L without a residual, which changes by up to 0.02 between fits of these units
+Fitted = TypeVar("Fitted")
+MAX_GAUSS_NEWTON_ITERATIONS = 60  # of Gauss-Newton
+FAR_ROUNDS = 9  # 99 % of 273 simulated fits need no more
+SMALL_LAST_STEP = 3e-3  # of a standard uncertainty: the last step taken
+SMALLEST_STEP = 1e-13  # g or deg/s: rounding
+COMPARED_STEP = 0.1  # the same where log L alone is compared, which is then within 0.005 a parameter of its maximum
+STALLED = 0.1  # of a standard uncertainty: a fit whose steps stay larger has not converged
+SAME_SCALE = 1e-4  # relative change of the noise's scale below which the weight of the prior is not changed
+UNDETERMINED_COLUMN_SHARE = 1e-8  # share of its columns below which a combination of parameters is not determined
+SCATTER_FACTORS = (3.0**0.5, 3.0**0.25, 3.0**0.125)  # factors of a scatter, on the way to its maximum
+SHARP = 0.5  # standard deviation of a scatter's logarithm, half a step of the grid
+RARE = 1e-3  # weight of a level below which it does not change the average
 
 
 def log_likelihood(rss: Values, n: int, log_determinant: Values) -> Values:
@@ -219,20 +231,6 @@ def judged_curves(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -
         gain = factor * max(float(after.max()) - best, 0.0)
         found.append((gain - count * float(np.log(n)), float(weight @ p)))
     return found
-
-
-Fitted = TypeVar("Fitted")
-MAX_GAUSS_NEWTON_ITERATIONS = 60  # of Gauss-Newton
-FAR_ROUNDS = 9  # 99 % of 273 simulated fits need no more
-SMALL_LAST_STEP = 3e-3  # of a standard uncertainty: the last step taken
-SMALLEST_STEP = 1e-13  # g or deg/s: rounding
-COMPARED_STEP = 0.1  # the same where log L alone is compared, which is then within 0.005 a parameter of its maximum
-STALLED = 0.1  # of a standard uncertainty: a fit whose steps stay larger has not converged
-SAME_SCALE = 1e-4  # relative change of the noise's scale below which the weight of the prior is not changed
-UNDETERMINED_COLUMN_SHARE = 1e-8  # share of its columns below which a combination of parameters is not determined
-SCATTER_FACTORS = (3.0**0.5, 3.0**0.25, 3.0**0.125)  # factors of a scatter, on the way to its maximum
-SHARP = 0.5  # standard deviation of a scatter's logarithm, half a step of the grid
-RARE = 1e-3  # weight of a level below which it does not change the average
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,8 @@ INSTABILITY_FACTORS = 3.0 ** np.arange(-2.0, 3.0)  # of the bias instability of 
 INSTABILITY_RATIOS = (0.1, 0.3, 1.0)  # of bias instability to white noise where none is stated
 START_SCATTERS = (0.0, 1.0, 3.0, 9.0, 27.0)  # of rests, of moves and of directions, for a covariance
 SELECTION_SCATTER = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and of moves, where models are compared
+# Parameters that are 1 in an ideal sensor; all others are 0.
+ONE = {f"{prefix}{axis}" for axis in "xyz" for prefix in ("scale_factor_", f"matrix_{axis}")}
 
 
 @dataclass(frozen=True)
@@ -317,10 +319,6 @@ def prior_hypotheses(prior: WanderPrior, white: float, kinds: int) -> list[Noise
     ]
     steady_moves = [h for h in hypotheses if kinds > 1 and h.scatter[1] in {START_SCATTERS[0], START_SCATTERS[2]}]
     return hypotheses + [replace(h, direction=c) for h in steady_moves for c in START_SCATTERS[2:]]
-
-
-# Parameters that are 1 in an ideal sensor; all others are 0.
-ONE = {f"{prefix}{axis}" for axis in "xyz" for prefix in ("scale_factor_", f"matrix_{axis}")}
 
 
 def limit_block(known: Mapping[str, float], columns: Values, state: State, unit: float = 1.0) -> EquationBlock:

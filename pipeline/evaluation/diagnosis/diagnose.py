@@ -83,6 +83,17 @@ if TYPE_CHECKING:
 
 EARTH = "earth_rotation"
 OTHER_FILE = "check that the sensor's file is that of this unit, and that its range and units are right"
+# an accelerometer whose mountings may be wrong
+IN_DOUBT = Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED
+LEANING = ("mounting", "table_axis_nonorthogonality")  # effects that tilt a turn axis in the body
+ERRORS_OUTSIDE_UNCERTAINTY = (
+    "bias",
+    "scale_factor",
+    "non_orthogonality",
+    "rotation",
+)  # errors of a method that its uncertainty excludes
+AVERAGING_TIMES_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position
+MIN_STRETCHES = 8  # stretches, which determine a standard deviation to a quarter
 
 
 def without_harmful(found: SensorDiagnosis, harmful: Mapping[str, str]) -> SensorDiagnosis:
@@ -163,17 +174,6 @@ def _temperatures(recordings: list[Recording]) -> tuple[float, float]:
     steps = np.diff(values)
     resolution = float(steps[steps > 0.0].min()) if np.any(steps > 0.0) else np.inf
     return float(np.ptp(values)), resolution
-
-
-# an accelerometer whose mountings may be wrong
-IN_DOUBT = Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED
-LEANING = ("mounting", "table_axis_nonorthogonality")  # effects that tilt a turn axis in the body
-ERRORS_OUTSIDE_UNCERTAINTY = (
-    "bias",
-    "scale_factor",
-    "non_orthogonality",
-    "rotation",
-)  # errors of a method that its uncertainty excludes
 
 
 def diagnose(
@@ -404,10 +404,6 @@ def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: st
     return SensorDiagnosis(
         Verdict.NOT_ENOUGH_DATA, configured, not_observable=dict.fromkeys(names, reason), next_experiment=needed
     )
-
-
-AVERAGING_TIMES_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position
-MIN_STRETCHES = 8  # stretches, which determine a standard deviation to a quarter
 
 
 def effective_noise(

@@ -67,6 +67,8 @@ SIGNAL_WORDS = {
     "time": "the time",
     ORIGIN: "the temperature above 25 degC",
 }
+Curves: TypeAlias = "Callable[[Motion], Values]"  # to (n, 1, q), or (n, 3, q) if they differ between the axes
+UNIT_ROUNDOFF = float(np.finfo(np.float64).eps) / 2.0  # u
 
 
 def columns_of(formulas: Iterable[str], sensor: str) -> Curves:
@@ -360,11 +362,6 @@ def described(form: Form, sizes: Values, axes: Sequence[int], sensor: str) -> st
     if form.factor.kind == "harmonic":
         return f"{phrase}, amplitude {size}"
     return f"{phrase}, of {size}" if form.is_height else f"{phrase}, {size} in all"
-
-
-Curves: TypeAlias = "Callable[[Motion], Values]"  # to (n, 1, q), or (n, 3, q) if they differ between the axes
-
-UNIT_ROUNDOFF = float(np.finfo(np.float64).eps) / 2.0  # u
 
 
 @dataclass(frozen=True)

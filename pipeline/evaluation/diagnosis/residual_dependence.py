@@ -88,6 +88,16 @@ SIGNAL_OF_COVARIATE = {
     "rate": "speed",
 }  # of covariates, for steps and polynomials
 SIMULATIONS = 199  # standard error of the share: 3.5 % at most
+OWN_BASE_COLUMNS = 4  # columns of the base on each axis
+RANK_OF_RESTS = 1e-8  # of singular values: columns that are the same to rounding
+PLOT_BINS = 40  # points that are distinct in a plot
+PLOT_DIGITS = 5  # more than a plot shows
+CURVE = 60  # points of the curve of a suggested form
+MIN_INFORMATION_SHARE = 0.01  # of the information on a shared coefficient; an axis with less is not shown
+# least share of a column's power in the rests; below it, a plot of rests does not show the effect
+MIN_REST_POWER_SHARE = 0.9
+MAX_PLOTS = 3  # plots of dependences
+ABSCISSA_SIGNALS = {"rate": "speed", "specific_force": "u"}  # abscissa of a covariate without a form, if not itself
 
 
 def dependences(selection: Selection, explained: Curves | None = None) -> list[Dependence]:
@@ -280,18 +290,6 @@ def _force(motion: Motion) -> Values:
     """Return Chebyshev polynomials of degree 3 to 5 of each component of the specific force: (n, 9) array."""
     scaled = motion.specific_force / max(float(np.abs(motion.specific_force).max()), 1.0)
     return np.concatenate([chebvander(scaled[:, i], CURVE_DEGREE)[:, 3:] for i in range(3)], axis=1)
-
-
-OWN_BASE_COLUMNS = 4  # columns of the base on each axis
-RANK_OF_RESTS = 1e-8  # of singular values: columns that are the same to rounding
-PLOT_BINS = 40  # points that are distinct in a plot
-PLOT_DIGITS = 5  # more than a plot shows
-CURVE = 60  # points of the curve of a suggested form
-MIN_INFORMATION_SHARE = 0.01  # of the information on a shared coefficient; an axis with less is not shown
-# least share of a column's power in the rests; below it, a plot of rests does not show the effect
-MIN_REST_POWER_SHARE = 0.9
-MAX_PLOTS = 3  # plots of dependences
-ABSCISSA_SIGNALS = {"rate": "speed", "specific_force": "u"}  # abscissa of a covariate without a form, if not itself
 
 
 def plots(selection: Selection, unexplained: Sequence[Dependence], noise: Noise | None, reported: Selection) -> JSON:

@@ -58,6 +58,10 @@ if TYPE_CHECKING:
 MOST_OF = 0.5  # share of the gain that the listed seconds have together
 MAX_INFLUENTIAL_STRETCHES = 5
 DETERMINED = 1e-6  # least information on an effect's weakest direction, over that of all recordings
+NEEDED_RECORDING = "record turns about all three axes on a table whose angle and rate are logged"
+# mean square of a residual over that of noise below which effects cannot explain a part of the excess
+UNEXPLAINABLE_RATIO = 1.1
+HELD_OUT_PIECES = 20  # of held-out motion: some seconds each
 
 
 def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
@@ -170,12 +174,6 @@ def _stretches(observations: Observations, shares: Values, of_block: Index) -> l
         for run in np.split(chosen, breaks)
     ]
     return sorted(found, key=lambda stretch: -stretch["share"])[:MAX_INFLUENTIAL_STRETCHES]
-
-
-NEEDED_RECORDING = "record turns about all three axes on a table whose angle and rate are logged"
-# mean square of a residual over that of noise below which effects cannot explain a part of the excess
-UNEXPLAINABLE_RATIO = 1.1
-HELD_OUT_PIECES = 20  # of held-out motion: some seconds each
 
 
 def findings(case: DiagnosisInput) -> Findings:

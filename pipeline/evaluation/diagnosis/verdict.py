@@ -44,6 +44,27 @@ MAX_OVER_NOISE = 5.0
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
 STATIC_AGAIN = "record static again: ten minutes or more at rest, on a base that does not shake"
 SAME_SESSION = "record static in the session of the other recordings, without switching the unit off in between"
+# Verdict, its reason (a macro of ``templates/reasons.txt``), and the condition. ``e.above``: the held-out error of the
+# calibration is above its interval.
+RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
+    (Verdict.REFERENCE_IN_DOUBT, "doubts", lambda e: e.doubts),
+    (Verdict.MISSING_EFFECT, "missing", lambda e: e.above and e.missing and not (e.full and e.full.above)),
+    (Verdict.UNEXPLAINED, "above_and_unexplained", lambda e: e.above and e.unexplained),
+    (Verdict.LEFT_BY_METHOD, "above_by_method", lambda e: e.above and e.of_method),
+    (Verdict.REFERENCE_IN_DOUBT, "static", lambda e: e.static_differs),
+    (Verdict.UNEXPLAINED, "above_as_the_residual", lambda e: e.above and e.at_noise is False),
+    (Verdict.REFERENCE_IN_DOUBT, "contradiction", lambda e: e.above),
+    (Verdict.UNEXPLAINED, "unexplained", lambda e: e.unexplained),
+    (Verdict.UNEXPLAINED, "moves", lambda e: e.moves and e.moves.over_largest > 1.0 and not e.missing),
+    (Verdict.UNEXPLAINED, "far_moves", lambda e: e.moves and e.moves.over_noise > MAX_OVER_NOISE and not e.missing),
+    (Verdict.UNEXPLAINED, "scatter", lambda e: e.scatter > MAX_SCATTER_BY_HAND and not e.missing),
+    (Verdict.MISSING_EFFECT, "missing", lambda e: e.missing),
+    (Verdict.REFERENCE_IN_DOUBT, "disagreement", lambda e: e.disagrees),
+    (Verdict.FLOOR_IN_DOUBT, "below", lambda e: e.published and e.published.below),
+    (Verdict.FLOOR_IN_DOUBT, "too_quiet", lambda e: e.too_quiet),
+    (Verdict.LEFT_BY_METHOD, "approximations", lambda e: e.found == Verdict.NOTHING_MISSING and e.approximations),
+    (Verdict.NOT_ENOUGH_DATA, "held", lambda e: e.found == Verdict.NOTHING_MISSING and e.held_by_limit),
+)
 
 
 @dataclass(frozen=True)
@@ -228,29 +249,6 @@ def _made_worse(held_out: SelectionErrors | None) -> bool:
     if held_out is None:
         return False
     return held_out.error_after**2 - held_out.error_before**2 > MAX_HELD_OUT_INCREASE * held_out.floor**2
-
-
-# Verdict, its reason (a macro of ``templates/reasons.txt``), and the condition. ``e.above``: the held-out error of the
-# calibration is above its interval.
-RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
-    (Verdict.REFERENCE_IN_DOUBT, "doubts", lambda e: e.doubts),
-    (Verdict.MISSING_EFFECT, "missing", lambda e: e.above and e.missing and not (e.full and e.full.above)),
-    (Verdict.UNEXPLAINED, "above_and_unexplained", lambda e: e.above and e.unexplained),
-    (Verdict.LEFT_BY_METHOD, "above_by_method", lambda e: e.above and e.of_method),
-    (Verdict.REFERENCE_IN_DOUBT, "static", lambda e: e.static_differs),
-    (Verdict.UNEXPLAINED, "above_as_the_residual", lambda e: e.above and e.at_noise is False),
-    (Verdict.REFERENCE_IN_DOUBT, "contradiction", lambda e: e.above),
-    (Verdict.UNEXPLAINED, "unexplained", lambda e: e.unexplained),
-    (Verdict.UNEXPLAINED, "moves", lambda e: e.moves and e.moves.over_largest > 1.0 and not e.missing),
-    (Verdict.UNEXPLAINED, "far_moves", lambda e: e.moves and e.moves.over_noise > MAX_OVER_NOISE and not e.missing),
-    (Verdict.UNEXPLAINED, "scatter", lambda e: e.scatter > MAX_SCATTER_BY_HAND and not e.missing),
-    (Verdict.MISSING_EFFECT, "missing", lambda e: e.missing),
-    (Verdict.REFERENCE_IN_DOUBT, "disagreement", lambda e: e.disagrees),
-    (Verdict.FLOOR_IN_DOUBT, "below", lambda e: e.published and e.published.below),
-    (Verdict.FLOOR_IN_DOUBT, "too_quiet", lambda e: e.too_quiet),
-    (Verdict.LEFT_BY_METHOD, "approximations", lambda e: e.found == Verdict.NOTHING_MISSING and e.approximations),
-    (Verdict.NOT_ENOUGH_DATA, "held", lambda e: e.found == Verdict.NOTHING_MISSING and e.held_by_limit),
-)
 
 
 def _of_residual(e: VerdictInput) -> str:

@@ -80,6 +80,15 @@ if TYPE_CHECKING:
 
 
 SPLINE_DEGREE = 3  # of the spline through a rate: 40 deg/s that change in 5 s are followed to 1e-4 deg/s at 0.12 s
+TAIL = 0.005  # probability on each side of a 99 % interval
+# Probabilities at which the factors are computed; the weight of each is the probability between the middles.
+LEVELS = np.array([0.0005, 0.004, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.996, 0.9995])
+WEIGHTS = np.diff(np.concatenate([[0.0], 0.5 * (LEVELS[1:] + LEVELS[:-1]), [1.0]]))
+HELD_OUT_BLOCKS = 40  # of all held-out recordings; wander within a block counts as noise with its correlation time
+SMALLEST_WIDTH = 0.5  # s of a wander of minutes, which may be a random walk (blind study, family null_random_walk)
+REST_SAMPLES = 300  # that determine the white noise without a static recording: a few rests of seconds
+EXACT_FREEDOM = 1e4  # degrees of freedom beyond which nu / chi^2(nu) is 1 to 1.4 %
+NORMAL_FREEDOM = 1e6  # beyond which a chi-square is normal to 1e-3
 
 
 def error_breakdown(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[list[StepErrors], list[str]]:
@@ -261,17 +270,6 @@ def _by_calibrated_log(calibration: SensorCalibration, effects: Sequence[FittedE
         return replace(found, specific_force_rate=nothing, angular_acceleration=nothing) if samples.resting else found
 
     return solve({sensor: SensorEffects.of(calibration, effects)}, readings, motion_of)[sensor]
-
-
-TAIL = 0.005  # probability on each side of a 99 % interval
-# Probabilities at which the factors are computed; the weight of each is the probability between the middles.
-LEVELS = np.array([0.0005, 0.004, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.996, 0.9995])
-WEIGHTS = np.diff(np.concatenate([[0.0], 0.5 * (LEVELS[1:] + LEVELS[:-1]), [1.0]]))
-HELD_OUT_BLOCKS = 40  # of all held-out recordings; wander within a block counts as noise with its correlation time
-SMALLEST_WIDTH = 0.5  # s of a wander of minutes, which may be a random walk (blind study, family null_random_walk)
-REST_SAMPLES = 300  # that determine the white noise without a static recording: a few rests of seconds
-EXACT_FREEDOM = 1e4  # degrees of freedom beyond which nu / chi^2(nu) is 1 to 1.4 %
-NORMAL_FREEDOM = 1e6  # beyond which a chi-square is normal to 1e-3
 
 
 @dataclass(frozen=True)

@@ -80,6 +80,10 @@ MIN_T_TEST_SAMPLES = 5  # of the t-test
 BIN_DEGC = 5.0  # a bias that follows the temperature by 1 mg/degC (MPU-6050) changes by 5 mg within it
 SWEEP_DEGC = 2 * BIN_DEGC  # fills two bins; a unit that warms up on the bench changes by less
 FEWEST_IN_BIN = 10  # samples of a bin that is shown
+EARTH_LEFT_OUT = (
+    "the held-out recording logs no attitude: Earth's rotation is left out of its reference, and the expected error "
+    f"allows for its {EARTH_RATE_DPS:.2g} deg/s"
+)
 
 
 def validate(
@@ -133,12 +137,6 @@ def validate(
             )
         part = replace(part, notes=tuple(notes), reduced=tuple(reduced(case, samples, held_out=part.held_out)))
     return replace(part, limits=_check_limits(calibration, part.steps[-1], settings.limits.of(sensor)))
-
-
-EARTH_LEFT_OUT = (
-    "the held-out recording logs no attitude: Earth's rotation is left out of its reference, and the expected error "
-    f"allows for its {EARTH_RATE_DPS:.2g} deg/s"
-)
 
 
 def _over_temperature(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) -> OverTemperature | None:

@@ -69,6 +69,16 @@ FRAME_REMARK = re.compile(r"the (\w+)'s x along")  # in such a remark: a sensor,
 BODY_AXIS = re.compile(r"along body ([+-][xyz])")
 NOISE_ALONE = re.compile(r"^\s*(accelerometer|gyroscope)_noise_density\s*:", re.MULTILINE)  # Kalibr's imu.yaml
 FORMAT_ROUNDING = 1e-12  # rounding errors of the formats' arithmetic, relative to the largest number
+CONVERSION_TOLERANCE = 1e-9  # g, deg/s or 1: smaller differences of a converted parameter are rounding
+WALK_S = 100.0  # correlation time of the wander that represents a random walk: K = s sqrt(2 / T), for any T
+NUMBER = re.compile(r"\d+\.\d+(?:e[-+]?\d+)?")
+# The worked example: a tilted body that turns, above the reference temperature.
+SAMPLE: dict[str, Any] = {
+    "accelerometer": np.array([0.1, -0.2, 0.97]),
+    "gyroscope": np.array([10.0, -20.0, 30.0]),
+    "temperature": 35.0,
+    "time": 600.0,
+}
 
 
 @dataclass(frozen=True)
@@ -319,10 +329,6 @@ def _fitted(name: str, sensor: str, values: Values) -> FittedEffect:
     return FittedEffect(name, {p.name: Coefficient(v, p.unit) for p, v in named})
 
 
-CONVERSION_TOLERANCE = 1e-9  # g, deg/s or 1: smaller differences of a converted parameter are rounding
-WALK_S = 100.0  # correlation time of the wander that represents a random walk: K = s sqrt(2 / T), for any T
-
-
 def document_of(imported: ImportedCalibration) -> JSON:
     """Return an imported calibration as ``calibrations/<unit>.json``; values that its file does not state are null."""
     if imported.document is not None:
@@ -454,16 +460,6 @@ def _differences(before: SensorCalibration, after: SensorCalibration, *, all_eff
         elif (change := np.abs(values[one.name] - one.values).max()) > CONVERSION_TOLERANCE:
             lines.append(f"the effect {one.name} changes by up to {change:.2g}")
     return lines
-
-
-NUMBER = re.compile(r"\d+\.\d+(?:e[-+]?\d+)?")
-# The worked example: a tilted body that turns, above the reference temperature.
-SAMPLE: dict[str, Any] = {
-    "accelerometer": np.array([0.1, -0.2, 0.97]),
-    "gyroscope": np.array([10.0, -20.0, 30.0]),
-    "temperature": 35.0,
-    "time": 600.0,
-}
 
 
 def explain_calibration(imported: ImportedCalibration) -> str:

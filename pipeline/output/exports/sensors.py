@@ -46,6 +46,8 @@ SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 AVERAGING_S = 1.0  # averaging time of the effective density in remarks
 FEWEST_AVERAGES = 9  # of a rest at the longest averaging time: 1 / sqrt(2 (9 - 1)) = 25 % (IEEE Std 952, annex C)
 INSTABILITY_FLOOR = 2.0 * np.log(2.0) / np.pi  # Allan variance of a bias instability of 1 (IEEE Std 952)
+TEMPERATURES = [-40.0, 85.0]  # degC, the widest specified range of such parts
+ORDER = 4  # coefficients of a polynomial of third order in the temperature
 
 
 @dataclass(frozen=True)
@@ -167,10 +169,6 @@ def _white_and_walk(terms: JSON, longest_s: float) -> list[Values | None]:
 
 def _rms(values: Sequence[Any]) -> Any:  # noqa: ANN401  (numbers, or lists of them)
     return np.sqrt(np.mean(np.square(values), axis=0)).tolist()
-
-
-TEMPERATURES = [-40.0, 85.0]  # degC, the widest specified range of such parts
-ORDER = 4  # coefficients of a polynomial of third order in the temperature
 
 
 class ExportedSensor:

@@ -38,6 +38,14 @@ QUANTILE_PARTS = 100  # of the fleet, each with its quantiles: one in 3.5 px
 MOST_PROBLEMS = 12  # lines of the list of what to do
 MOST_GROUPS = 50  # serials of several units, and joint estimates, that are listed
 MOST_LOTS = 60  # lots above which no medians lot by lot are shown
+MAX_DRAWN_SHARE = 3.0  # largest share that is drawn: one unit in a wrong unit of measurement must not hide the others
+# siblings below which there is no plot, and above which only the farthest are drawn
+FEWEST_SIBLINGS, MAX_PLOTTED_UNITS = 3, 60
+ENDS = 20  # farthest units of each parameter that are then drawn, on either side
+ROW, LEFT, NAME_LETTERS, NAME_LETTER = 17, 130, 22, 7.2  # px; letters of a unit's name, px of each
+NAMED_ROWS, HISTOGRAM_BINS = 40, 40  # most units with a row of their own; bins of the histogram of more units
+# of a row: range over which the units are distributed in their order; half height of a bar
+ROW_SPREAD, HALF_BAR = 0.6, 0.42
 
 
 def render(
@@ -300,16 +308,6 @@ def _quantiles(order: np.ndarray, values: np.ndarray, colour: int) -> list[Chart
     low, middle, high = np.array([np.nanquantile(values[p], [0.05, 0.5, 0.95]) for p in parts]).reshape(-1, 3).T
     x = np.array([order[p].mean() for p in parts])
     return [Area(low, high, colour, x), LineMark(x, middle, colour)]
-
-
-MAX_DRAWN_SHARE = 3.0  # largest share that is drawn: one unit in a wrong unit of measurement must not hide the others
-# siblings below which there is no plot, and above which only the farthest are drawn
-FEWEST_SIBLINGS, MAX_PLOTTED_UNITS = 3, 60
-ENDS = 20  # farthest units of each parameter that are then drawn, on either side
-ROW, LEFT, NAME_LETTERS, NAME_LETTER = 17, 130, 22, 7.2  # px; letters of a unit's name, px of each
-NAMED_ROWS, HISTOGRAM_BINS = 40, 40  # most units with a row of their own; bins of the histogram of more units
-# of a row: range over which the units are distributed in their order; half height of a bar
-ROW_SPREAD, HALF_BAR = 0.6, 0.42
 
 
 def strips(rows: Sequence[JSON], parameters: pd.DataFrame) -> list[UnitChart]:

@@ -64,6 +64,20 @@ ASKED = (
     ("reference equipment", "7.8.4.1 c", "certificate.equipment"),
     ("traceability", "7.8.4.1 c", "certificate.traceability"),
 )  # statements that the standard requires: name, clause and the key to set
+# Required by the schema (https://www.ptb.de/dcc/v3.2.1/dcc.xsd), in addition to ISO/IEC 17025.
+DEMANDED = {"certificate.country": "countryCodeISO3166_1"}
+PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")  # of performance, by the schema
+# Units of this product: factor to the SI, and powers of the units of D-SI (D-SI 2.1.0, BIPM SI brochure, table 8: deg).
+SI_UNITS: dict[str, tuple[float, dict[str, int]]] = {
+    "1": (1.0, {}),
+    "ppm": (1e-6, {}),
+    "g": (9.80665, {"metre": 1, "second": -2}),
+    "deg": (1.0, {"degree": 1}),
+    "s": (1.0, {"second": 1}),
+    "m": (1.0, {"metre": 1}),
+    "degC": (1.0, {"kelvin": 1}),  # in slopes: a difference
+}
+UNIT_TOKEN = re.compile(r"(\([^()]*\)|[^/()^]+)(?:\^(\d+))?")
 
 
 def certificate(
@@ -294,22 +308,6 @@ def certificate_page(unit: str, report: JSON) -> str:
     lacking = missing_for_dcc(report)
     page: str = template("certificate.html").render(unit=unit, report=report, sheet=codes, lacking=lacking)
     return page
-
-
-# Required by the schema (https://www.ptb.de/dcc/v3.2.1/dcc.xsd), in addition to ISO/IEC 17025.
-DEMANDED = {"certificate.country": "countryCodeISO3166_1"}
-PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")  # of performance, by the schema
-# Units of this product: factor to the SI, and powers of the units of D-SI (D-SI 2.1.0, BIPM SI brochure, table 8: deg).
-SI_UNITS: dict[str, tuple[float, dict[str, int]]] = {
-    "1": (1.0, {}),
-    "ppm": (1e-6, {}),
-    "g": (9.80665, {"metre": 1, "second": -2}),
-    "deg": (1.0, {"degree": 1}),
-    "s": (1.0, {"second": 1}),
-    "m": (1.0, {"metre": 1}),
-    "degC": (1.0, {"kelvin": 1}),  # in slopes: a difference
-}
-UNIT_TOKEN = re.compile(r"(\([^()]*\)|[^/()^]+)(?:\^(\d+))?")
 
 
 def missing_for_dcc(report: JSON) -> list[str]:

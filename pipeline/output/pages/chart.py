@@ -38,6 +38,15 @@ ANGLE_STEPS = (10.0, 15.0, 30.0, 45.0, 90.0, 180.0, 360.0, 720.0, 1800.0, 3600.0
 LINEAR_TO = 10.0  # value to which a symlog axis is linear: delta BIC of strong evidence
 
 Tick = tuple[float, str]
+AXES_LEGEND = (("c0", "x"), ("c1", "y"), ("c2", "z"))
+CHART_WIDTH = 420  # px, of the drawing; the page scales it
+LEFT, RIGHT, TOP, BOTTOM, PANEL_GAP = 72, 14, 8, 36, 14  # px, margins of the panels and the gap between two
+UPRIGHT = 28  # px, of height for each tick of axis y
+MAXIMUM_DOTS = 240  # samples drawn as dots; about one in 1.4 px
+BUCKETS = 140  # ranges drawn for more samples; about one in 2.4 px
+MAXIMUM_FULL = 20_000  # samples of a curve in a page (53 kB); of more samples, the ends of half as many buckets
+LARGE_DOTS, LARGE_MEANS = 300, 40  # dots, and dots with intervals, that have room to be large
+LETTER = 6.2  # px, width of a letter
 
 
 def round_ticks(low: float, high: float, count: int = 5, kind: str = "") -> list[Tick]:
@@ -149,17 +158,6 @@ class Axis:
         ticks = f' data-ticks="{escape("|".join(names))}"' if names else ""
         ends = f"{self.low:.9g},{self.high:.9g},{self.start:g},{self.stop:g}"
         return f' data-scale="{ends},{self.kind},{escape(typeset(label))}"{ticks}'
-
-
-AXES_LEGEND = (("c0", "x"), ("c1", "y"), ("c2", "z"))
-CHART_WIDTH = 420  # px, of the drawing; the page scales it
-LEFT, RIGHT, TOP, BOTTOM, PANEL_GAP = 72, 14, 8, 36, 14  # px, margins of the panels and the gap between two
-UPRIGHT = 28  # px, of height for each tick of axis y
-MAXIMUM_DOTS = 240  # samples drawn as dots; about one in 1.4 px
-BUCKETS = 140  # ranges drawn for more samples; about one in 2.4 px
-MAXIMUM_FULL = 20_000  # samples of a curve in a page (53 kB); of more samples, the ends of half as many buckets
-LARGE_DOTS, LARGE_MEANS = 300, 40  # dots, and dots with intervals, that have room to be large
-LETTER = 6.2  # px, width of a letter
 
 
 @dataclass(frozen=True)

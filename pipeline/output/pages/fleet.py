@@ -67,6 +67,11 @@ FLEET_TEST_LEVEL = 0.001  # of the tests of drift and lots, for a whole fleet
 MOST_PAIRED = 1000  # units from which the slope is computed: it needs all pairs of them, 50 MB
 DAYS_OF_A_YEAR = 365.25
 SIBLINGS = ["sensor", "method"]
+SHOWN = 12  # runs in a chart: the first, and the last ones
+LABEL_LETTERS = 50  # letters of a bar's text before the ratio; a bar is 66 letters long
+STATES = 10_000  # of units in runs after the first that a campaign's page contains: 2 MB at 0.2 kB each
+UNCHANGED_ERROR = 0.02  # relative change of an error that is not significant
+NEAR_FLOOR = 1.5  # error over noise floor below which a bar is green
 
 
 def parameter_table(units: Mapping[str, Sequence[Sequence[Any]]]) -> pd.DataFrame:
@@ -288,13 +293,6 @@ def _cell(value: object) -> object:
     if isinstance(value, str):
         return spreadsheet_cell(value)
     return f"{value:.9g}" if isinstance(value, float) else value
-
-
-SHOWN = 12  # runs in a chart: the first, and the last ones
-LABEL_LETTERS = 50  # letters of a bar's text before the ratio; a bar is 66 letters long
-STATES = 10_000  # of units in runs after the first that a campaign's page contains: 2 MB at 0.2 kB each
-UNCHANGED_ERROR = 0.02  # relative change of an error that is not significant
-NEAR_FLOOR = 1.5  # error over noise floor below which a bar is green
 
 
 def with_history(page: str, states: Sequence[tuple[int, JSON]], times: Mapping[int, str]) -> str:

@@ -52,6 +52,13 @@ SOURCES = {
 }
 BEFORE_AFTER = (("c3", "before"), ("c2", "after"))
 SILENT = Noise(np.zeros(3), np.zeros(3), 100.0, "none")  # errors are drawn, not weighted
+# Factor between white noise and data sheet above which a cause is named: the digital filters of an MPU-6050 (5 to
+# 260 Hz) change the white noise of a sample by sqrt(52) = 7 at one sampling rate, its ranges by 2 to 8.
+MAX_TIMES_DATA_SHEET = 5.0
+# factor between both below which they count as equal: data sheets state typical values to about 30 %
+EQUAL_NOISE_FACTOR = 1.3
+SURE_TERM_PROBABILITY = 0.9  # probability of a set of terms above which no other set is named
+SYMBOLS = dict(zip(TERM_UNITS, "QNBKGRA", strict=True))
 
 
 def checks(validation: JSON | None) -> list[JSON]:
@@ -204,15 +211,6 @@ def _attitude_panel(curve: JSON, name: str, label: str) -> Panel:
     later = later[later > 0]
     limits = (float(later.min()) / 1.2, float(later.max()) * 1.2) if later.size else (1e-3, 1.0)
     return Panel([LineMark(time, v, c) for c, v in angles.items()], label, 110, limits=limits, logarithmic=True)
-
-
-# Factor between white noise and data sheet above which a cause is named: the digital filters of an MPU-6050 (5 to
-# 260 Hz) change the white noise of a sample by sqrt(52) = 7 at one sampling rate, its ranges by 2 to 8.
-MAX_TIMES_DATA_SHEET = 5.0
-# factor between both below which they count as equal: data sheets state typical values to about 30 %
-EQUAL_NOISE_FACTOR = 1.3
-SURE_TERM_PROBABILITY = 0.9  # probability of a set of terms above which no other set is named
-SYMBOLS = dict(zip(TERM_UNITS, "QNBKGRA", strict=True))
 
 
 def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON | None) -> Figure | None:

@@ -45,6 +45,8 @@ TYPOGRAPHIC = {
     "sqrt(s)": "√s",
     "gauss markov": "Gauss-Markov",
 }
+TEMPLATES = Path(__file__).parent / "templates"
+PUBLISHED_DATA = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # in a campaign's page
 
 
 def number(value: object, digits: int = 3) -> str:
@@ -158,12 +160,6 @@ def aligned(rows: Sequence[Sequence[str]], width: int | None = None) -> list[str
         head = "".join(f"{cell.ljust(size)}  " for cell, size in zip(cells, widths, strict=True))
         lines += [f"  {head}{parts[0]}".rstrip(), *(" " * start + part for part in parts[1:])]
     return lines
-
-
-TEMPLATES = Path(__file__).parent / "templates"
-
-
-PUBLISHED_DATA = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # in a campaign's page
 
 
 def _figure(value: object, scale: Scale | None = None) -> str:

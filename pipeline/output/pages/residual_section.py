@@ -77,6 +77,31 @@ ONE_IN_A_THOUSAND = float(np.sqrt(2.0 * np.log(1000.0)))  # quantile 0.999 of th
 FLAT = 2.0  # mean square of the means over noise and wander, below which the page calls them flat
 NOISE_ALONE_RATIO = 1.1  # residual over noise below which the page states that the residual is noise
 MODEL_POINTS = 150  # of a model's line: about the number of ranges in a chart
+COVARIATES: dict[str, Callable[[Residual], Values | None]] = {
+    "angle, deg": lambda r: None if r.motion.angle is None else np.mod(r.motion.angle, 360.0),
+    "rate, deg/s": lambda r: r.motion.rate,
+    "specific force x, g": lambda r: r.motion.specific_force[:, 0],
+    "specific force y, g": lambda r: r.motion.specific_force[:, 1],
+    "specific force z, g": lambda r: r.motion.specific_force[:, 2],
+    "temperature, degC": lambda r: r.motion.temperature,
+    "time, s": lambda r: r.motion.time if r.recording.clock_shared else r.motion.time - r.motion.time[0],
+}
+RIVAL_SHARE = 0.8  # share of the selected effect's delta BIC above which another effect is named as a rival
+# effects and brackets that a chart or its caption shows
+MAX_CHART_EFFECTS, MIN_CHART_EFFECTS, MOST_HIDDEN, MAX_CAPTION_BRACKETS = 9, 3, 6, 2
+EXCLUDED = 0.5  # of the upper limit by the prior alone, below which the recordings exclude an effect: convention
+MOST_LIMITS = 8  # upper limits that a chart shows
+ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors: 1 for noise, more for correlated bins
+MOST_EXPLAINED = 0.97  # share of the points' variance that a line must explain where they are farther off
+SIGNAL_NAMES = {
+    "temperature": "temperature, degC",
+    "time": "time since power-on, s",
+    "speed": "magnitude of the angular rate, deg/s",
+    "rate": "angular rate of the rate table, deg/s",
+    "angle": "angle of the rate table, deg",
+    **{f"f{a}": f"specific force along {a}, g" for a in AXES},
+    **{f"w{a}": f"angular rate about {a}, deg/s" for a in AXES},
+}
 
 
 @dataclass(frozen=True)
@@ -160,17 +185,6 @@ def _binned_mean(covariate: Values, error: Values) -> _BinnedMean | None:
     scatter = np.sqrt(np.maximum(np.mean(error**2, axis=0) - between, 0.0)) + 1e-300
     centre = low + (np.arange(RESIDUAL_BINS) + 0.5) * (high - low) / RESIDUAL_BINS
     return _BinnedMean(centre, mean, scatter / np.sqrt(count)[:, None])
-
-
-COVARIATES: dict[str, Callable[[Residual], Values | None]] = {
-    "angle, deg": lambda r: None if r.motion.angle is None else np.mod(r.motion.angle, 360.0),
-    "rate, deg/s": lambda r: r.motion.rate,
-    "specific force x, g": lambda r: r.motion.specific_force[:, 0],
-    "specific force y, g": lambda r: r.motion.specific_force[:, 1],
-    "specific force z, g": lambda r: r.motion.specific_force[:, 2],
-    "temperature, degC": lambda r: r.motion.temperature,
-    "time, s": lambda r: r.motion.time if r.recording.clock_shared else r.motion.time - r.motion.time[0],
-}
 
 
 def covariates(found: list[Residual], wander: Values) -> dict[str, _BinnedMean]:
@@ -331,24 +345,6 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
         "angle of the rate table, deg" if turns else "time, s",
         kind="angle" if turns else "",
     )
-
-
-RIVAL_SHARE = 0.8  # share of the selected effect's delta BIC above which another effect is named as a rival
-# effects and brackets that a chart or its caption shows
-MAX_CHART_EFFECTS, MIN_CHART_EFFECTS, MOST_HIDDEN, MAX_CAPTION_BRACKETS = 9, 3, 6, 2
-EXCLUDED = 0.5  # of the upper limit by the prior alone, below which the recordings exclude an effect: convention
-MOST_LIMITS = 8  # upper limits that a chart shows
-ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors: 1 for noise, more for correlated bins
-MOST_EXPLAINED = 0.97  # share of the points' variance that a line must explain where they are farther off
-SIGNAL_NAMES = {
-    "temperature": "temperature, degC",
-    "time": "time since power-on, s",
-    "speed": "magnitude of the angular rate, deg/s",
-    "rate": "angular rate of the rate table, deg/s",
-    "angle": "angle of the rate table, deg",
-    **{f"f{a}": f"specific force along {a}, g" for a in AXES},
-    **{f"w{a}": f"angular rate about {a}, deg/s" for a in AXES},
-}
 
 
 def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:

@@ -60,6 +60,13 @@ OF_THE_TURN = ("angle", "rate")
 OPTIONAL_FIELDS = ("temperature", "angle", "rate", "level")  # fields that a motion may lack
 TRUTHS = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
 OWN = {"accelerometer": "f", "gyroscope": "w"}  # signals of that field
+EFFECT_NAME = re.compile(r"[a-z][a-z0-9_]{0,49}")
+TERM = re.compile(r"[A-Za-z](?=.{0,19}$)[A-Za-z0-9_]*\*?[A-Za-z0-9_]*")
+RESERVED = ("auto", "all", "none")
+NUMBER = re.compile(r"(?<![\w.])\d+\.?\d*(?:e[-+]?\d+)?")
+PROBES, ALIKE = 200, 1e-9  # places; largest relative difference, by rounding, of values that are equal
+MOST_TERMS, LONGEST_TEXT, LONGEST_UNIT = 12, 500, 30  # above every built-in effect; they limit pages and fits
+REQUIRED = ("name", "owner", "sensors", "meaning")
 
 
 class DeclaredEffect(Effect):
@@ -223,14 +230,6 @@ def _of(motion: Motion, before: str = " of recording") -> str:
     return f"{before} {motion.recording}" if motion.recording else ""
 
 
-EFFECT_NAME = re.compile(r"[a-z][a-z0-9_]{0,49}")
-TERM = re.compile(r"[A-Za-z](?=.{0,19}$)[A-Za-z0-9_]*\*?[A-Za-z0-9_]*")
-RESERVED = ("auto", "all", "none")
-NUMBER = re.compile(r"(?<![\w.])\d+\.?\d*(?:e[-+]?\d+)?")
-PROBES, ALIKE = 200, 1e-9  # places; largest relative difference, by rounding, of values that are equal
-MOST_TERMS, LONGEST_TEXT, LONGEST_UNIT = 12, 500, 30  # above every built-in effect; they limit pages and fits
-
-
 @dataclass(frozen=True)
 class Term:
     """A term of an effect: its formulas, and a coefficient for each axis or for all."""
@@ -389,7 +388,6 @@ def _term(given: Any) -> Term:  # noqa: ANN401
 
 TEXT = _line(LONGEST_TEXT)
 TERM_CHECKS: dict[str, Check] = {"unit": _by_sensor(_line(LONGEST_UNIT)), "meaning": TEXT}
-REQUIRED = ("name", "owner", "sensors", "meaning")
 CHECKS: dict[str, Check] = {
     "name": _name,
     "owner": one_of(*Owner),

@@ -50,6 +50,12 @@ if TYPE_CHECKING:
 ROTATION_ITERATIONS = 6  # of a fixed point; rotations of 10 deg converge by a factor of 30 in each
 ROTATION_STEP_DEG = 1e-3  # of the central difference of a rotation: its error is (step^2 / 6) rad = 5e-11
 VECTORS = ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate", "direction", "level")
+SEPARATOR = "@"
+EXPERIMENT = "the same turns in another setup"
+AS_THE_BASE = (
+    *("owner", "layout", "sensors", "unseen", "needs", "needs_clock", "needs_motion", "needs_both_directions"),
+    *("meaning", "excitation", "experiment", "source"),
+)
 
 
 def rotated(motion: Motion, rotation: Values) -> Motion:
@@ -206,14 +212,6 @@ class EncoderZero(_OfRecordings):
         """Return ``exp([zero e_a]x)``."""
         assert motion.axis is not None  # noqa: S101
         return turn_by_vector(np.radians(values) * np.eye(3)[motion.axis])
-
-
-SEPARATOR = "@"
-EXPERIMENT = "the same turns in another setup"
-AS_THE_BASE = (
-    *("owner", "layout", "sensors", "unseen", "needs", "needs_clock", "needs_motion", "needs_both_directions"),
-    *("meaning", "excitation", "experiment", "source"),
-)
 
 
 class _Mounting(Effect):

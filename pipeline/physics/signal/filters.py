@@ -65,6 +65,10 @@ BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
     "band_pass": "bandpass",
     "band_stop": "bandstop",
 }
+KERNEL_BLOCK = 256  # cells at once: their kernels stay in the processor's cache
+NARROWEST_S = 0.5  # below the thermal time constant of a package, which is seconds
+RELATIVE_ROUNDING = 1e-12  # relative: some thousand roundings of a double
+DISTINCT, AT_ENDS = 6.0, 5.0  # standard deviations; by how much the variance is larger at the ends of a file
 
 
 def apply_filter(recording: Recording, settings: Filter) -> Recording:
@@ -277,12 +281,6 @@ def _timing_notes(recording: Recording) -> tuple[Note, ...]:
         detail = f"{recording.name}: {count} intervals are off the median by over 10 %; the filter takes them as even"
         notes.append(Note("N-FILTER-JITTER", count, 0, 0, detail))
     return tuple(notes)
-
-
-KERNEL_BLOCK = 256  # cells at once: their kernels stay in the processor's cache
-NARROWEST_S = 0.5  # below the thermal time constant of a package, which is seconds
-RELATIVE_ROUNDING = 1e-12  # relative: some thousand roundings of a double
-DISTINCT, AT_ENDS = 6.0, 5.0  # standard deviations; by how much the variance is larger at the ends of a file
 
 
 def smooth_temperature(time: Values, temperature: Values, bandwidth: float = 10.0) -> Values:

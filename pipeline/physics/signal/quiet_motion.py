@@ -56,6 +56,18 @@ if TYPE_CHECKING:
 PARABOLA_DEGREE = 2  # of the parabola
 SIGNIFICANT_CREEP = 4.0  # standard deviations: of the two components, noise alone passes it in 3e-4
 FEWEST_OF_A_SLOPE = 8  # samples from which a slope has five degrees of freedom
+QUIET_WINDOW_S, MIN_WINDOW_SAMPLES = 0.2, 3  # shorter than a move; samples that have a variance
+SIGNIFICANT_TURN = 6.0  # q above
+NEIGHBOUR_STRETCHES = 5  # stretches: their median withstands two that turned
+RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests differ by g-sensitivity and creep
+# Of a window's mean, whatever the tremor of the stretch. The rests of a published MPU-6050 recording in a hand reach
+# 1.7 except at the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
+TREMOR_LIMIT_DPS = 2.5
+SAME_DEG = 2.0  # the limit of a rest in ``pipeline.physics.signal.rests``
+ROUNDING_TERMS = 1000  # harmonics, with which u^2 of readings without noise is 6e-4 too small
+COARSE = float(np.sqrt(0.25 + 1.0 / 12.0))  # steps, scatter of readings with noise of half a step
+DIFFERENCE_BLOCK, MIN_DIFFERENCE_BLOCKS = 16, 8  # differences of a block; blocks of a recording that show its noise
+DECIMAL_ROUNDING = 1e-6  # relative, of a difference of decimals
 
 
 @dataclass(frozen=True)
@@ -149,20 +161,6 @@ def creep_of_readings(time: Values, force: Values, share: float = 0.0) -> Creep:
         return Creep(np.zeros(3), measured, uncertainty, 0.0, squares, freedom)
     variance = float(np.mean(np.sum(path**2, axis=1))) / length**2
     return Creep(measured, measured, uncertainty, 0.5 * variance, squares, freedom)
-
-
-QUIET_WINDOW_S, MIN_WINDOW_SAMPLES = 0.2, 3  # shorter than a move; samples that have a variance
-SIGNIFICANT_TURN = 6.0  # q above
-NEIGHBOUR_STRETCHES = 5  # stretches: their median withstands two that turned
-RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests differ by g-sensitivity and creep
-# Of a window's mean, whatever the tremor of the stretch. The rests of a published MPU-6050 recording in a hand reach
-# 1.7 except at the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
-TREMOR_LIMIT_DPS = 2.5
-SAME_DEG = 2.0  # the limit of a rest in ``pipeline.physics.signal.rests``
-ROUNDING_TERMS = 1000  # harmonics, with which u^2 of readings without noise is 6e-4 too small
-COARSE = float(np.sqrt(0.25 + 1.0 / 12.0))  # steps, scatter of readings with noise of half a step
-DIFFERENCE_BLOCK, MIN_DIFFERENCE_BLOCKS = 16, 8  # differences of a block; blocks of a recording that show its noise
-DECIMAL_ROUNDING = 1e-6  # relative, of a difference of decimals
 
 
 def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: float, shortest: int) -> Spans:

@@ -70,6 +70,10 @@ LEAST_TURNED_DEG, LEAST_ERROR_DEG = 10.0, 1e-4  # of a table's turn that counts;
 # in the source of a recording on a table (of a sheet)
 LOGGED_TURNS, AXIS_ACCURACY = "table_turns", "table_axis_accuracy_deg"
 HANDLED_DPS, NEAR_A_MOVE_S = 3.0, 0.5  # above bias and vibration of a resting unit; the logs' clocks may differ
+SCALE = 0.1  # relative: three times the largest scale factor error of the shipped data sheets (MPU-6050: 3 %)
+# 15 deg between the turn and a body axis: misalignment of the chip in its case, and error of the hand
+MAX_AXIS_SINE = 0.25
+HALF_S = WINDOW_S + SHORTEST_REST_S  # shortest half of a divided rest that is found again: a window is trimmed
 
 
 class Segment(NamedTuple):
@@ -313,12 +317,6 @@ class _Session:
 
 def _is_useful(group: Sequence[Move]) -> bool:
     return group[0].kind[1] == "turn" or (group[0].kind[1] == "step" and len(group) >= FEWEST_STOPS - 1)
-
-
-SCALE = 0.1  # relative: three times the largest scale factor error of the shipped data sheets (MPU-6050: 3 %)
-# 15 deg between the turn and a body axis: misalignment of the chip in its case, and error of the hand
-MAX_AXIS_SINE = 0.25
-HALF_S = WINDOW_S + SHORTEST_REST_S  # shortest half of a divided rest that is found again: a window is trimmed
 
 
 def multiples(angle: Values, stated_deg: float) -> tuple[int, int]:
