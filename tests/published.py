@@ -8,7 +8,6 @@ import numpy as np
 
 from pipeline.core.records import Candidate, Noise, SensorValidation, StepErrors, Validation
 from pipeline.evaluation.diagnosis.diagnose import diagnose as diagnosis_of
-from pipeline.evaluation.held_out import heldout
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,7 +24,7 @@ def validation_document(unit: str, parts: Mapping[str, SensorValidation | None])
 
 def validate(*arguments: Any, **keywords: Any) -> dict[str, Any]:
     """Return a sensor's part of ``validations/<unit>.json``."""
-    return heldout.validate(*arguments, **keywords).to_json()
+    return validation.validate(*arguments, **keywords).to_json()
 
 
 def candidate(name: str, **values: Any) -> Candidate:

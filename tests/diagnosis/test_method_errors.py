@@ -14,7 +14,7 @@ from unit_settings import filter_of, settings_of, with_noise
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import fit_stage
 from pipeline.evaluation.diagnosis.words import in_words
-from pipeline.evaluation.held_out.heldout import validate
+from pipeline.evaluation.held_out.validation import validate
 from pipeline.physics.signal.filters import apply_filter
 from pipeline.simulation.description import shipped_settings
 from tests.published import diagnose

@@ -14,7 +14,7 @@ from pipeline.core.records import Recording, SensorCalibration
 from pipeline.estimation import effects, reference_least_squares
 from pipeline.estimation.noise import estimate_noise
 from pipeline.evaluation.diagnosis.verdict import DISAGREES
-from pipeline.evaluation.held_out.heldout import validate
+from pipeline.evaluation.held_out.validation import validate
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 from tests.published import diagnose

@@ -16,7 +16,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.evaluation.held_out.attitude import gravity_direction
-from pipeline.evaluation.held_out.heldout import validate
+from pipeline.evaluation.held_out.validation import validate
 from tests.published import diagnose
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.core.records import Coefficient, FittedEffect, SensorCalibration
-from pipeline.evaluation.held_out.heldout import residuals_over_temperature
 from pipeline.evaluation.held_out.samples import Samples
+from pipeline.evaluation.held_out.validation import residuals_over_temperature
 
 SLOPE = 2e-3  # g/degC, of z
 

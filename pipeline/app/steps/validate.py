@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from pipeline.core.records import SensorValidation, Validation, calibrated
 from pipeline.estimation.noise import required_noises
 from pipeline.evaluation.held_out.attitude import attitude, gravity_direction, turn_departures
-from pipeline.evaluation.held_out.heldout import validate
+from pipeline.evaluation.held_out.validation import validate
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

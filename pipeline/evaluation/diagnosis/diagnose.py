@@ -66,8 +66,8 @@ from pipeline.evaluation.diagnosis.verdict import (
 )
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.evaluation.held_out.error_breakdown import last_step
-from pipeline.evaluation.held_out.heldout import last_error, static_error
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, samples_of_motion
+from pipeline.evaluation.held_out.validation import last_error, static_error
 from pipeline.physics.effects import catalogue, effect, effect_of
 from pipeline.physics.effects.base import parameter_limits, truth, unit_of
 from pipeline.physics.kinematics import EARTH_RATE_DPS

@@ -1,7 +1,7 @@
 """Select the effects that the model of a sensor lacks, from turns on a table.
 
 The held-out error of a fit is the rms length of ``matrix (reading - model)`` if the attitude is logged, else the rms
-error of the magnitude. It is compared with the noise floor of ``pipeline.evaluation.held_out.heldout``.
+error of the magnitude. It is compared with the noise floor of ``pipeline.evaluation.held_out.validation``.
 
 Find the recordings and seconds that show an effect, and whether the evidence depends on one recording.
 
@@ -42,8 +42,8 @@ from pipeline.evaluation.diagnosis.residual_dependence import dependences, goodn
 from pipeline.evaluation.diagnosis.verdict import verdict_of_selection
 from pipeline.evaluation.diagnosis.words import FAR_OFF, plain
 from pipeline.evaluation.held_out.error_breakdown import with_known_effects
-from pipeline.evaluation.held_out.heldout import noise_floors
 from pipeline.evaluation.held_out.samples import samples_of_motion
+from pipeline.evaluation.held_out.validation import noise_floors
 from pipeline.physics.effects import catalogue, effect
 
 if TYPE_CHECKING:
