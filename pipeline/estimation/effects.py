@@ -11,6 +11,7 @@ from pipeline.core.records import SensorCalibration
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.candidates import AUTO, MOUNTING, configured_effects, limits_of, offered
 from pipeline.estimation.generalized_least_squares import fit_joint
+from pipeline.estimation.harm import fits_of, harmful_in_turns, left_out, rests_in_turn
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.fit import plausible, require_observable
 from pipeline.estimation.multi_position.model import selection_hypotheses
@@ -59,7 +60,9 @@ def fit(
             return before
         data_sheet = settings.sensor.of(sensor)
         chosen = select(observations, names, noise, data_sheet, accelerometer=accelerometer)
-        names += offered(chosen.names, chosen.fit.terms, chosen.fit.covariance, data_sheet, sensor)
+        added = offered(chosen.names, chosen.fit.terms, chosen.fit.covariance, data_sheet, sensor)
+        harm = harmful_in_turns(chosen, fits_of(chosen)) if added else {}
+        names += [name for name in added if name not in harm]
     if not names:
         return before
     return fit_joint(sensor, recordings.filtered, names, noise, settings, before, accelerometer)
@@ -160,7 +163,10 @@ def fit_effects_by_rests(
     names = [] if wanted == AUTO else list(wanted)
     if wanted == AUTO:
         chosen = SelectionByHand(model, before, [], noise, data_sheet)
-        names = offered(chosen.names, chosen.fit.state.terms, chosen.fit.covariance, data_sheet, sensor)
+        added = offered(chosen.names, chosen.fit.state.terms, chosen.fit.covariance, data_sheet, sensor)
+        parts = [(model.without(rests), rests) for rests in rests_in_turn(model)] if added else []
+        harm = left_out(chosen, parts).harmful(chosen.names) if added else {}
+        names = [name for name in added if name not in harm]
     if not names:
         return before
     for name in names:

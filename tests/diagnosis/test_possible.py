@@ -9,8 +9,9 @@ from unit_settings import settings_of
 
 from pipeline.core.records import Candidate, Estimate, Noise, Recording, SensorCalibration, SensorDiagnosis
 from pipeline.core.verdicts import Verdict
+from pipeline.estimation.harm import harmful
 from pipeline.evaluation.diagnosis.diagnose import without_harmful, without_impossible
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput, harmful
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput
 from pipeline.evaluation.diagnosis.verdict import MAX_SCATTER_BY_HAND, VerdictInput, decide
 
 if TYPE_CHECKING:

@@ -129,7 +129,7 @@ def without_impossible(found: SensorDiagnosis, case: DiagnosisInput) -> SensorDi
         found,
         verdict=found.verdict if doubted else Verdict.UNEXPLAINED,
         selected=(),
-        candidates=reasons,
+        candidates={**found.candidates, **reasons},
         reason=f"{found.reason} {told[0].upper()}{told[1:]}.".strip(),
         next_experiment=found.next_experiment if doubted else OTHER_FILE,
         override="",

@@ -5,10 +5,7 @@ q s`` with its ratio q to the white noise s, is compared with that of the rests 
 
     inflated:   sigma > 3 sigma_expected   and   log L(best) - max {log L(q, tau): q s <= 3 sigma_expected} > 5
 
-Effects that raise the held-out error significantly are candidates and not offered, and the others stay selected: where
-the differences d of the squared errors, with minus without them, of n units of exchange (rests, moves, pieces of the
-held-out motion) have ``mean(d) > t_95(m - 1) s(d) / sqrt(m)``, with ``m = n (1 - r) / (1 + r)`` and the correlation r
-of successive ones.
+Effects that raise the held-out error significantly (``pipeline.estimation.harm``) are candidates and not offered.
 """
 
 from __future__ import annotations
@@ -17,7 +14,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy
 
 from pipeline.core.records import Answer, Candidate, Estimate, SensorDiagnosis, Wander, standard_uncertainty
 from pipeline.core.verdicts import Verdict
@@ -46,8 +42,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.ranking import Score
 
-FEWEST_EXCHANGED = 5  # units of exchange that have a scatter
-HARM_CONFIDENCE, MAX_CORRELATION = 0.95, 0.9  # one-sided; r of successive units, see above
 LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings
 
 
@@ -245,33 +239,3 @@ def _wander(findings: Findings) -> Wander:
         inflated=bool(inflated),
         scatter_over_noise=findings.scatter_over_noise,
     )
-
-
-def harmful(names: Sequence[str], squares: Sequence[Values], what: str) -> dict[str, str]:
-    """Return the last of the selected effects with which the error rises significantly, with the reason.
-
-    ``squares``: of each unit of exchange, without effects, and with each further one; ``what``: the error, in words. An
-    effect may raise the error while another one is missing, so that all are compared with fewer.
-    """
-    found: dict[str, str] = {}
-    count = len(names)
-    while count:
-        fewer = next((k for k in range(count - 1, -1, -1) if _raises(squares[k], squares[count])), None)
-        if fewer is None:
-            break
-        ratio = float(np.sqrt(np.mean(squares[count]) / np.mean(squares[fewer])))
-        found |= dict.fromkeys(names[fewer:count], f"it makes the error {what} {ratio:.4g} times as large")
-        count = fewer
-    return found
-
-
-def _raises(before: Values, after: Values) -> bool:
-    """Return whether the mean of the squared errors of units of exchange rises significantly: (n,) arrays in order."""
-    change, n = after - before, len(after)
-    if n < FEWEST_EXCHANGED or not np.mean(change) > 0.0:
-        return False
-    apart = change - np.mean(change)
-    r = float(np.clip(apart[1:] @ apart[:-1] / max(float(apart @ apart), 1e-300), 0.0, MAX_CORRELATION))
-    m = n * (1.0 - r) / (1.0 + r)
-    limit = float(scipy.special.stdtrit(max(m - 1.0, 1.0), HARM_CONFIDENCE))
-    return bool(np.mean(change) > limit * np.std(change, ddof=1) / np.sqrt(m))

@@ -6,7 +6,8 @@ unknown. So a larger scatter of the rests is reported, but alone it is no sign o
 Twenty rests are too few to hold some out of a selection. So the selection uses all of them, and cross-validation
 judges it: each of ``REST_FOLDS`` models leaves out every third rest with the move before it. ``held_out_error`` of a
 ranking is that of the selected effects, fitted without those rests. ``cross_validation`` also repeats the selection. An
-effect that raises the error at these rests, or after these moves, significantly is not offered (``findings.harmful``).
+effect that raises the error at these rests, or after these moves, significantly is not offered
+(``pipeline.estimation.harm``).
 
 The residual depends on time, temperature (powers 1 to 2 or 3 over their span) or the axis' own specific force
 (Chebyshev polynomials of degree 4 and 5) if such curves, with free coefficients on every axis, have delta BIC > 10 and
@@ -16,7 +17,7 @@ m p < 1e-3, with m the number of all tests (``fit.judged_curves``).
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
@@ -29,24 +30,23 @@ from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.effects import model_of
 from pipeline.estimation.engine import ScaledColumns, cholesky
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
+from pipeline.estimation.harm import REST_FOLDS, LeftOut, left_out, rests_in_turn
 from pipeline.estimation.multi_position.fit import (
     CEILING_TO,
     COMPARED_STEP,
     MIN_NEW_NORM_SHARE,
     FitByHand,
-    fit,
     judged_curves,
     log_likelihoods,
     project_out,
 )
-from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import NoiseHypothesis
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import SelectionByHand, posterior
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import is_given
 from pipeline.evaluation.diagnosis import functional_forms as forms
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, harmful
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.evaluation.diagnosis.method_errors import given_differences
 from pipeline.evaluation.diagnosis.observability import MORE_RESTS, never_shown, not_observable_by_hand
 from pipeline.evaluation.diagnosis.residual_dependence import added_variable_of_rests, significant
@@ -64,8 +64,6 @@ if TYPE_CHECKING:
 
 NEEDED_RECORDING = MORE_RESTS
 WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"
-REST_FOLDS = 3  # as every third rest is held out of a published fit (procedure.holdout_every)
-SPARE = 2  # least number of equations beyond the parameters in a fold
 LEAST_SPAN = 1.0  # s or degC: of a covariate
 FORCE = ("8 * u ** 4 - 8 * u ** 2 + 1", "16 * u ** 5 - 20 * u ** 3 + 5 * u")  # Chebyshev polynomials of u in g
 FEWEST_PARTS = 8  # of a soak that heats and cools
@@ -235,49 +233,17 @@ def _over_noise(model: Model, equations: Equations, expected: NoiseHypothesis) -
     return float(np.sqrt(residual @ residual / freedom)) if freedom > 0 else None
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """The squared errors of each fit of a selection at rests, and in moves, that are left out of it in turn."""
-
-    of_rests: Sequence[Values]  # each (m,), g^2 or (deg/s)^2; without a fit's effects, and with each further one
-    of_moves: Sequence[Values] = ()  # each (k,), deg^2; of the gyroscope
-    judged: Sequence[bool] = ()  # whether each fit has some degrees of freedom in every fold
-
-    @property
-    def errors(self) -> list[float | None]:
-        """The rms error of each fit."""
-        pairs = zip(self.of_rests, self.judged, strict=True)
-        return [float(np.sqrt(np.mean(squares))) if known else None for squares, known in pairs]
-
-    def harmful(self, names: Sequence[str]) -> dict[str, str]:
-        """Return the effects that raise an error significantly, with the reason."""
-        of_moves = harmful(names, self.of_moves, "after moves that the fit leaves out") if self.of_moves else {}
-        return of_moves | harmful(names, self.of_rests, "at rests that the fit leaves out")
-
-
 def _held_out(selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand, Mask]]) -> LeftOut:
     """Return the errors of each fit of the selection on rests and moves that are left out of it in turn."""
-    model = selection.model
     if not folds:  # a recording for validation, or nothing is selected
-        squares = [model.held_out_squares(each.state) for each in selection.fits]
+        squares = [selection.model.held_out_squares(each.state) for each in selection.fits]
         return LeftOut(squares, judged=[bool(selection.names) and len(squares[0]) > 0] * len(squares))
-    rests, moves, judged = [], [], []
-    left_out = [model.without(~held) for _, held in folds] if isinstance(model, GyroscopeModel) else []
-    moving = bool(left_out) and all(part.moves is not None for part in left_out)
-    for k, each in enumerate(selection.fits):
-        fits = [
-            fold.fits[k]
-            if fold.names[:k] == selection.names[:k]
-            else fit(fold.model, each.state, selection.hypotheses, selection.bounds, small=COMPARED_STEP)
-            for fold, _ in folds
-        ]
-        judged.append(all(len(fitted.residual) >= fitted.rank + SPARE for fitted in fits))
-        pairs = list(zip(folds, fits, strict=True))
-        rests.append(np.concatenate([fold.model.held_out_squares(fitted.state) for (fold, _), fitted in pairs]))
-        if moving:
-            errors = [part.direction_errors(f.state)[0] for part, f in zip(left_out, fits, strict=True)]
-            moves.append(np.concatenate(errors) ** 2)
-    return LeftOut(rests, moves, judged)
+
+    def known(k: int, count: int) -> FitByHand | None:
+        same = folds[k][0].names[:count] == selection.names[:count]
+        return folds[k][0].fits[count] if same else None
+
+    return left_out(selection, [(fold.model, held) for fold, held in folds], known)
 
 
 def _cross_validation(
@@ -306,8 +272,7 @@ def _folds(
     model = selection.model
     if not selection.names or len(model.held_out_squares(selection.fits[0].state)):
         return []
-    held: list[Mask] = [np.arange(len(model.rests.time)) % REST_FOLDS == k for k in range(REST_FOLDS)]
-    return [(select(model.without(rests)), rests) for rests in held]
+    return [(select(model.without(rests)), rests) for rests in rests_in_turn(model)]
 
 
 class _Curve(NamedTuple):

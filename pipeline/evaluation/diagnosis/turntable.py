@@ -29,12 +29,13 @@ from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Design, EffectColumns, free_curves, placed
 from pipeline.estimation.gates import min_delta_bic
 from pipeline.estimation.gauss_markov import GaussMarkov
-from pipeline.estimation.generalized_least_squares import JointFit, calibration_of, design_at, fit_terms
+from pipeline.estimation.generalized_least_squares import JointFit, calibration_of, design_at
+from pipeline.estimation.harm import fits_of, harmful, harmful_in_turns
 from pipeline.estimation.observations import observe, without_each_recording
 from pipeline.estimation.posterior import posterior
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, harmful
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, why_not_suggested
 from pipeline.evaluation.diagnosis.method_errors import method_errors
 from pipeline.evaluation.diagnosis.observability import alike_with_zeros, never_shown, not_observable, one_way
@@ -215,7 +216,7 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     """Return the findings of a selection and a discovery."""
     sensor, noise, selection, reported = case.sensor, case.noise, discovery.context, discovery.reported
     observations, unknown = selection.observations, discovery.unknown
-    fits = _fits(reported)
+    fits = fits_of(reported)
     squares_held_out, floor = _held_out_squares(reported, fits, case)
     errors = [float(np.sqrt(np.nanmean(squares))) for squares in squares_held_out]
     held_out = None
@@ -278,7 +279,7 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
         drop_alone=drop_alone,
         excess=excess,
         held_out=errors or [None] * len(fits),
-        harmful=_harmful(reported.names, squares_held_out),
+        harmful=harmful_effects(reported, fits, squares_held_out),
         hidden={**hidden, **alike_with_zeros(reported)},
         unknown=unknown,
         over_noise=_over_noise(selection.base, case, reference),
@@ -301,22 +302,12 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     )
 
 
-def _fits(selection: Selection) -> list[JointFit]:
-    """Return the fits of the base and with each further selected effect."""
-    fits = [selection.base]
-    fitted = {term.effect.name: term for term in selection.fit.terms}
-    for count in range(1, len(selection.names)):
-        terms = [*selection.base.terms, *(fitted[name] for name in selection.names[:count])]
-        fits.append(fit_terms(selection.observations, terms, selection.fit, selection.settings))
-    return [*fits, selection.fit] if selection.names else fits
-
-
-def _harmful(names: Sequence[str], squares: Sequence[Values]) -> dict[str, str]:
-    """Return the effects that raise the error on held-out motion significantly, with the reason."""
+def harmful_effects(selection: Selection, fits: Sequence[JointFit], squares: Sequence[Values]) -> dict[str, str]:
+    """Return the effects that raise the error on held-out motion or, without it, in left-out stretches of the turns."""
     if not squares:
-        return {}
+        return harmful_in_turns(selection, fits)
     pieces = np.array([[np.nanmean(p) for p in np.array_split(each, HELD_OUT_PIECES)] for each in squares])
-    return harmful(names, [*pieces[:, np.isfinite(pieces).all(axis=0)]], "on held-out motion")
+    return harmful(selection.names, [*pieces[:, np.isfinite(pieces).all(axis=0)]], "on held-out motion")
 
 
 def _held_out_squares(

@@ -1,0 +1,169 @@
+"""Effects that raise the error of readings that a fit leaves out, and so are not offered.
+
+The differences d of the squared errors, with minus without an effect, of n units of exchange (rests, moves, stretches
+of turns, pieces of the held-out motion) have
+
+    mean(d) > t_95(m - 1) s(d) / sqrt(m),   m = n (1 - r) / (1 + r)
+
+with the correlation r of successive ones. The others stay selected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+
+from pipeline.estimation.generalized_least_squares import design_at, fit_terms
+from pipeline.estimation.multi_position.fit import COMPARED_STEP, fit
+from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
+from pipeline.estimation.observations import without_rows
+from pipeline.estimation.ranking import projection
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from pipeline.core.records import Mask, Values
+    from pipeline.estimation.generalized_least_squares import JointFit
+    from pipeline.estimation.multi_position.fit import FitByHand
+    from pipeline.estimation.multi_position.model import Model
+    from pipeline.estimation.multi_position.selection import SelectionByHand
+    from pipeline.estimation.selection import Selection
+
+FEWEST_EXCHANGED = 5  # units of exchange that have a scatter
+HARM_CONFIDENCE, MAX_CORRELATION = 0.95, 0.9  # one-sided; r of successive units, see above
+REST_FOLDS = 3  # as every third rest is held out of a published fit (procedure.holdout_every)
+TURN_FOLDS, LEFT_OUT_STRETCHES = 5, 20  # a fold leaves out a fifth of every recording, in four stretches
+SPARE = 2  # least number of equations beyond the parameters in a fold
+
+
+def harmful(names: Sequence[str], squares: Sequence[Values], what: str) -> dict[str, str]:
+    """Return the last of the selected effects with which the error rises significantly, with the reason.
+
+    ``squares``: of each unit of exchange, without effects, and with each further one; ``what``: the error, in words. An
+    effect may raise the error while another one is missing, so that all are compared with fewer.
+    """
+    found: dict[str, str] = {}
+    count = len(names)
+    while count:
+        fewer = next((k for k in range(count - 1, -1, -1) if _raises(squares[k], squares[count])), None)
+        if fewer is None:
+            break
+        ratio = float(np.sqrt(np.mean(squares[count]) / np.mean(squares[fewer])))
+        found |= dict.fromkeys(names[fewer:count], f"it makes the error {what} {ratio:.4g} times as large")
+        count = fewer
+    return found
+
+
+def _raises(before: Values, after: Values) -> bool:
+    """Return whether the mean of the squared errors of units of exchange rises significantly: (n,) arrays in order."""
+    change, n = after - before, len(after)
+    if n < FEWEST_EXCHANGED or not np.mean(change) > 0.0:
+        return False
+    apart = change - np.mean(change)
+    r = float(np.clip(apart[1:] @ apart[:-1] / max(float(apart @ apart), 1e-300), 0.0, MAX_CORRELATION))
+    m = n * (1.0 - r) / (1.0 + r)
+    limit = float(scipy.special.stdtrit(max(m - 1.0, 1.0), HARM_CONFIDENCE))
+    return bool(np.mean(change) > limit * np.std(change, ddof=1) / np.sqrt(m))
+
+
+def fits_of(selection: Selection) -> list[JointFit]:
+    """Return the fits of the base and with each further selected effect."""
+    fits = [selection.base]
+    fitted = {term.effect.name: term for term in selection.fit.terms}
+    for count in range(1, len(selection.names)):
+        terms = [*selection.base.terms, *(fitted[name] for name in selection.names[:count])]
+        fits.append(fit_terms(selection.observations, terms, selection.fit, selection.settings))
+    return [*fits, selection.fit] if selection.names else fits
+
+
+def harmful_in_turns(selection: Selection, fits: Sequence[JointFit]) -> dict[str, str]:
+    """Return the effects that raise the error in stretches of the turns that the fit leaves out, with the reason.
+
+    Each fit is repeated without a fifth of every recording by one step from its values.
+    """
+    names, observations = selection.names, selection.observations
+    if not names:
+        return {}
+    stretches = [np.arange(len(part.weight)) * LEFT_OUT_STRETCHES // len(part.weight) for part in observations.parts]
+    weight, of_fold = observations.weight, np.concatenate(stretches) % TURN_FOLDS
+    label = np.concatenate([k * LEFT_OUT_STRETCHES + each for k, each in enumerate(stretches)])
+    used = np.bincount(label, weight, len(stretches) * LEFT_OUT_STRETCHES)
+    folds = [without_rows(observations, [each % TURN_FOLDS == k for each in stretches]) for k in range(TURN_FOLDS)]
+    squares = []
+    for each in fits:
+        design, errors = each.design(observations), np.zeros(len(weight))
+        for k, rest in enumerate(folds):
+            products = design_at(rest, each).products([each.setting])[0]
+            step = projection(products, np.arange(products.shape[1] - 1))[0][:, -1]
+            for c in range(3):
+                columns, places = design.of_axis(c), design.places(c)[1]
+                left = columns[:, -1] - columns[:, :-1] @ step[places[:-1]]
+                errors += np.where(of_fold == k, (left / each.scale[c]) ** 2, 0.0)
+        squares.append(np.bincount(label, weight * errors, len(used))[used > 0.0] / used[used > 0.0])
+    return harmful(names, squares, "in stretches of turns that the fit leaves out")
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """The squared errors of each fit of a selection at rests, and in moves, that are left out of it in turn."""
+
+    of_rests: Sequence[Values]  # each (m,), g^2 or (deg/s)^2; without a fit's effects, and with each further one
+    of_moves: Sequence[Values] = ()  # each (k,), deg^2; of the gyroscope
+    judged: Sequence[bool] = ()  # whether each fit has some degrees of freedom in every fold
+
+    @property
+    def errors(self) -> list[float | None]:
+        """The rms error of each fit."""
+        pairs = zip(self.of_rests, self.judged, strict=True)
+        return [float(np.sqrt(np.mean(squares))) if known else None for squares, known in pairs]
+
+    def harmful(self, names: Sequence[str]) -> dict[str, str]:
+        """Return the effects that raise an error significantly, with the reason."""
+        of_moves = harmful(names, self.of_moves, "after moves that the fit leaves out") if self.of_moves else {}
+        return of_moves | harmful(names, self.of_rests, "at rests that the fit leaves out")
+
+
+def rests_in_turn(model: Model) -> list[Mask]:
+    """Return the rests of a model, every third in turn, as masks."""
+    return [np.arange(len(model.rests.time)) % REST_FOLDS == k for k in range(REST_FOLDS)]
+
+
+def left_out(
+    selection: SelectionByHand,
+    parts: Sequence[tuple[Model, Mask]],
+    known: Callable[[int, int], FitByHand | None] = lambda _fold, _count: None,
+) -> LeftOut:
+    """Return the errors of a selection's fits on rests and moves that are left out of it in turn.
+
+    ``parts``: models without some of the rests, and which. ``known``: returns the fit of a fold with so many of the
+    selected effects, or None.
+    """
+    model = selection.model
+    rests, moves, judged = [], [], []
+    models = [part for part, _ in parts]
+    others = [model.without(~held) for _, held in parts] if isinstance(model, GyroscopeModel) else []
+    moving = bool(others) and all(part.moves is not None for part in others)
+    for count, each in enumerate(selection.fits):
+        fits = [
+            known(k, count) or fit(part, each.state, selection.hypotheses, selection.bounds, small=COMPARED_STEP)
+            for k, part in enumerate(models)
+        ]
+        judged.append(all(len(fitted.residual) >= fitted.rank + SPARE for fitted in fits))
+        rests.append(
+            np.concatenate([_at_rests(model, part, fitted) for part, fitted in zip(models, fits, strict=True)])
+        )
+        if moving:
+            errors = [part.direction_errors(f.state)[0] for part, f in zip(others, fits, strict=True)]
+            moves.append(np.concatenate(errors) ** 2)
+    return LeftOut(rests, moves, judged)
+
+
+def _at_rests(model: Model, part: Model, fitted: FitByHand) -> Values:
+    """Return the squared errors at the rests of a model that a part of it leaves out, without those that both do."""
+    squares = part.held_out_squares(fitted.state)
+    if isinstance(model, GyroscopeModel) and isinstance(part, GyroscopeModel):
+        return np.asarray(squares[~model.every.held_out[part.every.held_out]])
+    return squares
