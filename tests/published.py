@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.core.records import Candidate, Noise, SensorValidation, StepErrors, Validation
 from pipeline.evaluation.diagnosis.diagnose import diagnose as diagnosis_of
+from pipeline.evaluation.held_out import validation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
