@@ -253,11 +253,16 @@ def test_the_stairs_go_on_to_what_the_missing_effect_would_bring() -> None:
     held_out["noise"] = {"source": "static", "wander_source": "data_sheet", "correlation_time_source": "data_sheet"}
     found = diagnosis_of("accelerometer")
     found["ranking"][0] |= {"held_out_error_before": 0.19, "held_out_error_after": 0.021}
+    found["held_out"] = {"error_before": 0.19, "error_after": 0.021, "floor": 0.02}
     figure = error_steps("accelerometer", held_out, found, IN_G, vector=True)
     assert figure is not None
     assert "+ quadratic nonlinearity, if added" in figure.svg
     assert "White noise by the static recording, bias wander by the sensor file" in figure.caption
-    assert figure.finding == ("The error of the vector ends at 200 mg, 10.0 × noise; with the missing effects, at 22.1")
+    assert figure.finding == ("The error of the vector ends at 200 mg, 10.0 × noise; with the missing effects, at 21.0")
+    by_hand = error_steps("accelerometer", held_out, found | {"held_out": None}, IN_G, vector=True)
+    assert by_hand is not None
+    assert by_hand.finding.endswith("; with the missing effects, at about 21")
+    assert "+ quadratic nonlinearity, if added, about" in by_hand.svg
     magnitude = error_steps("accelerometer", held_out, found, IN_G, vector=False)
     assert magnitude is not None
     assert "if added" not in magnitude.svg  # the diagnosis tells the error of the vector

@@ -5,10 +5,11 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from pipeline.output.pages import campaign_page, unit_page
@@ -52,6 +53,8 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = {"accelerometer": ["Quadratic nonlinearity is missing."], "gyroscope": []}
     (folder / "unit.html").write_text(unit_page.render(*unit.arguments, words=words))
     (folder / "campaign.html").write_text(campaign_page.render("factory", fleet(), failures(), history=runs()))
+    failed = {"unit": "U1", "status": "failed", "error": {"code": "bad_input", "message": "x", "file": None}}
+    (folder / "failed.html").write_text(unit_page.render(failed, None, None, [], unit.settings))
     x = np.linspace(0.0, 10.0, 11)
     (folder / "chart.html").write_text(one_chart(LineMark(x, 3.0 * x - 1.0, 0)))
     (folder / "samples.html").write_text(one_chart(SampleMarks(*noisy_samples(), mean=True)))
@@ -559,3 +562,22 @@ def test_on_paper_a_page_has_no_controls(browser: Browser, pages: Path) -> None:
     assert page.locator("nav:visible, .tools:visible, input:visible, .chart-hint:visible").count() == 0
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
     page.context.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("name", ["unit", "campaign", "failed"])
+def test_axe_finds_nothing(browser: Browser, pages: Path, name: str, scheme: Literal["light", "dark"]) -> None:
+    page = browser.new_page(color_scheme=scheme)
+    page.goto((pages / f"{name}.html").as_uri())
+    found = Axe().run(page).response["violations"]
+    assert [(rule["id"], [node["target"] for node in rule["nodes"]][:5]) for rule in found] == []
+    page.close()
+
+
+@pytest.mark.parametrize(("name", "shown"), [("unit", True), ("failed", False)])
+def test_charts_are_explained_where_there_is_one(browser: Browser, pages: Path, name: str, *, shown: bool) -> None:
+    page = browser.new_page()
+    page.goto((pages / f"{name}.html").as_uri())
+    assert (page.locator("svg[data-scale]").count() > 0) == shown
+    assert page.locator(".chart-hint").is_visible() == shown
+    page.close()

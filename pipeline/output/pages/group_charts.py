@@ -45,7 +45,7 @@ class Point:
 
     ``interval``: low and high of a mean, drawn with the dot; ``units``: the values that are averaged; ``floor``:
     value of this row by noise alone; ``x, series``: position in ``curves``, which joins the points of a series;
-    ``note``: part of the description.
+    ``note``: part of the description; ``digits``: of the value.
     """
 
     label: str
@@ -57,6 +57,7 @@ class Point:
     x: float = 0.0
     series: str = ""
     note: str = ""
+    digits: int = 3
 
 
 def bars(
@@ -97,7 +98,8 @@ def bars(
         out.append(text(min(max(at, LEFT + half), CHART_WIDTH - half), top - 4, words, "m"))
     for at, row in drawn:
         if row.value is not None and row.interval is None:
-            digits, left = number(row.value), max(axis.pixels(0.0), axis.pixels(row.value)) + 4 + 4 * (kind == "log")
+            digits = number(row.value, row.digits)
+            left = max(axis.pixels(0.0), axis.pixels(row.value)) + 4 + 4 * (kind == "log")
             lines = [line for line in map(axis.pixels, levels.values()) if left < line < left + LETTER * len(digits)]
             out.append(text(max(lines, default=left - 4) + 4, at + 24, digits, "value"))  # right of a level, not on it
     out += [_row(row, axis, top + ROW * i) for i, row in enumerate(rows) if row.value is None]
@@ -117,7 +119,7 @@ def _description(points: Sequence[Point]) -> str:
     for p in points:
         interval = f", 95 % interval {number(p.interval[0])} to {number(p.interval[1])}" if p.interval else ""
         note = f", {p.note}" if p.note else ""
-        texts.append(f"{p.series}{', ' if p.series else ''}{p.label}: {number(p.value)}{interval}{note}")
+        texts.append(f"{p.series}{', ' if p.series else ''}{p.label}: {number(p.value, p.digits)}{interval}{note}")
     return "; ".join(texts)
 
 

@@ -303,6 +303,6 @@ for (const figure of document.querySelectorAll("figure")) {
   tools.append(button);
   figure.prepend(tools);
 }
-for (const hint of document.querySelectorAll(".chart-hint")) hint.hidden = false;
+for (const hint of document.querySelectorAll(".chart-hint")) hint.hidden = !document.querySelector("svg[data-scale]");
 if (window.parent !== window) // shown inside of another page, such as a report of Snakemake: links to other pages do not work
   for (const link of document.querySelectorAll("a[href]:not([href^='#'])")) link.replaceWith(...link.childNodes);
