@@ -148,7 +148,8 @@ def _report(folder: Path, cores: int) -> None:
         states = [row["status"] for row in csv.DictReader(stream)]
     units, ok = len(states), states.count("ok")
     files = sum(file.is_file() for file in results.rglob("*"))
-    size = sum(file.lstat().st_size for file in (results / "batches").rglob("*") if file.is_file())
+    packs = {(s := file.lstat()).st_ino: s.st_size for file in (results / "batches").rglob("*") if file.is_file()}
+    size = sum(packs.values())  # the last output of each job has two names
     spent: dict[str, float] = defaultdict(float)
     jobs: dict[str, int] = defaultdict(int)
     memory: dict[str, float] = defaultdict(float)

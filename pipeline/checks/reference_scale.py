@@ -93,6 +93,7 @@ GRAVITY_TURNS = ("gravity's direction", 1e-2)  # relative: clocks without quartz
 SAME_ANGLE = 2e-4  # relative: 0.07 deg in a turn, error of gravity's direction by an accelerometer's nonlinearities
 # samples; blocks of a sandwich estimate; Gauss-Newton steps
 FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, GEAR_ITERATIONS = 200, 24, 4
+SURELY = 0.5  # share of what is allowed: further steps change the first by a tenth at most
 CONVERGED = 1e-12  # relative step, far below the uncertainty of any ratio
 SHARES = np.arange(1, BLOCKS_OF_A_GEAR) / BLOCKS_OF_A_GEAR
 UNIT_FACTOR_TOLERANCE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
@@ -195,12 +196,13 @@ def check_scale_of_motion(recording: Recording, size: Values | None, limits: Cha
 
 def doubt_of_angle(recording: Recording, limits: ChannelLimits) -> str | None:
     """Return the doubt that a turn's angle differs from gravity's by a factor: an encoder's counts, a gear."""
-    found = _gear(recording)
+    if recording.table_angle is None:
+        return None
+    allowed = limits.rate_stated + limits.angle_stated_deg / float(np.ptp(recording.table_angle)) + SAME_ANGLE
+    found = _gear(recording, allowed)
     if found is None:
         return None
     ratio, spread = found
-    assert recording.table_angle is not None  # noqa: S101
-    allowed = limits.rate_stated + limits.angle_stated_deg / float(np.ptp(recording.table_angle)) + SAME_ANGLE
     if abs(ratio - 1.0) <= allowed + SIGNIFICANT_UNCERTAINTIES * spread:
         return None
     return (
@@ -210,8 +212,11 @@ def doubt_of_angle(recording: Recording, limits: ChannelLimits) -> str | None:
     )
 
 
-def _gear(recording: Recording) -> tuple[float, float] | None:
-    """Return the ratio of the table's angle to gravity's, and its standard uncertainty; None if it is unknown."""
+def _gear(recording: Recording, allowed: float) -> tuple[float, float] | None:
+    """Return the ratio of the table's angle to gravity's, and its standard uncertainty.
+
+    None if it is unknown, or if the first step shows that it differs from 1 by less than is ``allowed``.
+    """
     angle, rate, force = recording.table_angle, recording.logged_rate, recording.accelerometer
     if recording.role != "gyroscope":  # in a turn of minutes, a bias that follows the temperature has the same signal
         return None
@@ -224,7 +229,7 @@ def _gear(recording: Recording) -> tuple[float, float] | None:
     y = force[keep][:, [(axis + 1) % 3, (axis + 2) % 3]]
     a = logged = np.radians(angle[keep] - float(np.mean(angle[keep])))
     slope, late = np.gradient(w, t), (t - t[0]) / (t[-1] - t[0])
-    for _ in range(GEAR_ITERATIONS):
+    for iteration in range(GEAR_ITERATIONS):
         c, s = np.cos(a), np.sin(a)
         columns = [np.ones_like(a), c, s, w * c, w * s, w * w, slope, late, late * late]
         columns += [f(k * a) for k in (2, 3) for f in (np.cos, np.sin)]
@@ -239,6 +244,8 @@ def _gear(recording: Recording) -> tuple[float, float] | None:
             e[:, k] -= every @ (every.T @ e[:, k])
         information = float(np.sum(d * d))
         step = float(np.sum(d * e)) / information
+        if iteration == 0 and abs(step) <= SURELY * allowed:
+            return None
         a = a * (1.0 + step)
         if abs(step) < CONVERGED:
             break

@@ -300,8 +300,9 @@ class GaussMarkov:
         half, phi, below, root = (np.expand_dims(np.ascontiguousarray(v.T), axis) for v in factors)
         z = np.expand_dims(columns[self._order], 3 - axis) / half
         z[1:] -= phi * z[:-1]
-        for k in range(1, len(z)):  # z = L^-1 w
-            z[k] -= below[k - 1] * z[k - 1]
+        rows, part = [*z], np.empty(z.shape[1:])
+        for before, row, factor in zip(rows, rows[1:], below, strict=False):  # z = L^-1 w
+            np.subtract(row, np.multiply(factor, before, out=part), out=row)
         z /= root
         return np.ascontiguousarray(z.transpose(3 - axis, axis, 0))
 

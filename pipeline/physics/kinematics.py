@@ -185,7 +185,7 @@ class EncoderTrajectory:
 
     def at(self, time: Values) -> tuple[Values, Values, Values]:
         """Return angle (deg), rate (deg/s) and acceleration (deg/s^2) at any times; (n,) arrays."""
-        k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self._step) - 1)
+        k = self._interval(time)
         x = time - self.time[k]
         angle, rate, acceleration = self._piecewise(k, x)
         smooth = ~self.explained[k]
@@ -193,14 +193,25 @@ class EncoderTrajectory:
             angle[smooth], rate[smooth], acceleration[smooth] = self._quintic(k[smooth], x[smooth])
         return angle, rate, acceleration
 
+    def angle_at(self, time: Values) -> Values:
+        """Return the angle (deg) at any times: (n,) array."""
+        k = self._interval(time)
+        x = time - self.time[k]
+        angle, smooth = self._angle(k, x, np.maximum(x - self._bend[k], 0.0)), ~self.explained[k]
+        if smooth.any():
+            angle[smooth] = self._quintic(k[smooth], x[smooth])[0]
+        return angle
+
+    def _interval(self, time: Values) -> Index:
+        return np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self._step) - 1)
+
     def known_at(self, time: Values) -> Mask:
         """Return at which of n times, near the samples, the trajectory is valid: (n,) array.
 
         A time from ``MEMORY_S`` before its sample to the next sample is valid if the sample is in ``valid_samples``.
         Any other time must lie between two valid samples.
         """
-        step = np.append(self._step, 0.0)
-        k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self._step) - 1)
+        step, k = np.append(self._step, 0.0), self._interval(time)
         near = (time > self.time - MEMORY_S) & (time <= self.time + step)
         return np.where(near, self.valid_samples, self.valid_samples[k] & self.valid_samples[k + 1])
 
@@ -222,7 +233,7 @@ class EncoderTrajectory:
             shown = following
             if settled:
                 break
-        k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self._step) - 1)
+        k = self._interval(time)
         x = np.maximum(time - self.time[k], 0.0)
         through, gain = self._lag_step(k, x, lag)
         value = through + gain * shown[k]
@@ -241,8 +252,12 @@ class EncoderTrajectory:
         a, b, s = self._before[k], self._after[k], self._bend[k]
         past = np.maximum(x - s, 0.0)
         rate = self.rate[k] + a * x + (b - a) * past
-        angle = self.angle[k] + self.rate[k] * x + 0.5 * a * x**2 + 0.5 * (b - a) * past**2
-        return angle, rate, np.where(x > s, b, a)
+        return self._angle(k, x, past), rate, np.where(x > s, b, a)
+
+    def _angle(self, k: Index, x: Values, past: Values) -> Values:
+        a, b = self._before[k], self._after[k]
+        angle: Values = self.angle[k] + self.rate[k] * x + 0.5 * a * x**2 + 0.5 * (b - a) * past**2
+        return angle
 
     def _quintic(self, k: Index, x: Values) -> tuple[Values, Values, Values]:
         h = self._step[k]
@@ -365,12 +380,14 @@ def _motion_of_turn(
         """Return the motion at ``time + before + offset``, filtered by a first-order lag in s."""
         offset = before + offset
         moved = bool(np.any(offset))
-        angle, rate, acceleration = log.at(time + offset) if moved else (log.angle, log.rate, log.acceleration)
-        level = turn_about_axis(home, axis, -angle)
         if lag > 0.0:
+            angle = log.angle_at(time + offset) if moved else log.angle
             rate, acceleration = log.lagged(time + offset, lag)
-            past = [turn_about_axis(home, axis, -log.at(time + offset - lag * node)[0]) for node in NODES]
-            level = np.tensordot(WEIGHTS, np.array(past), 1)
+            past = np.radians([-log.angle_at(time + offset - lag * node) for node in NODES])
+            level = turn_by(home, axis, WEIGHTS @ np.cos(past), WEIGHTS @ np.sin(past))
+        else:
+            angle, rate, acceleration = log.at(time + offset) if moved else (log.angle, log.rate, log.acceleration)
+            level = turn_about_axis(home, axis, -angle)
         force = gravity_g * level[:, 2, :]
         omega, alpha = np.zeros_like(force), np.zeros_like(force)
         omega[:, axis], alpha[:, axis] = rate, acceleration
@@ -452,10 +469,18 @@ def _motion_of_attitude(
 
 def turn_about_axis(vector: Values, axis: int, angle_deg: Values) -> Values:
     """Turn (..., 3) vectors about coordinate axis 0, 1 or 2 by each of n angles (right-handed): (n, ..., 3) array."""
+    angle = np.radians(angle_deg)
+    return turn_by(vector, axis, np.cos(angle), np.sin(angle))
+
+
+def turn_by(vector: Values, axis: int, cosine: Values, sine: Values) -> Values:
+    """Return ``turn_about_axis`` by n angles of known cosine and sine, or by the mean of several turns: of both.
+
+    The mean of turns leaves what is along the axis.
+    """
     j, k = (axis + 1) % 3, (axis + 2) % 3
-    angle = np.radians(angle_deg).reshape(-1, *[1] * (vector.ndim - 1))
-    c, s = np.cos(angle), np.sin(angle)
-    out = np.empty((len(angle), *vector.shape))
+    c, s = (v.reshape(-1, *[1] * (vector.ndim - 1)) for v in (cosine, sine))
+    out = np.empty((len(c), *vector.shape))
     out[..., axis] = vector[..., axis]
     out[..., j] = c * vector[..., j] - s * vector[..., k]
     out[..., k] = s * vector[..., j] + c * vector[..., k]

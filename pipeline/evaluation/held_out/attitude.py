@@ -182,15 +182,15 @@ def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]
         magnetic_rejection=0.0,
         rejection_timeout=0.0,
     )
-    q = np.empty((len(chosen), 4))
-    q[0] = alone[:, 0]
-    fusion = imufusion.Ahrs().set_settings(settings).skip_startup().set_quaternion(q[0])
+    q = [alone[:, 0]]
+    fusion = imufusion.Ahrs().set_settings(settings).skip_startup().set_quaternion(q[0].copy())
+    set_period, update, attitude = fusion.set_sample_period, fusion.update_no_magnetometer, fusion.get_quaternion
     # The filter compares the force with the attitude before its step.
-    for n, (interval, rate, reading) in enumerate(zip(intervals.tolist(), rates, force[chosen[:-1]], strict=True), 1):
-        fusion.set_sample_period(interval)
-        fusion.update_no_magnetometer(rate, reading)
-        q[n] = fusion.get_quaternion()
-    return chosen, q
+    for interval, rate, reading in zip(intervals.tolist(), rates, force[chosen[:-1]], strict=True):
+        set_period(interval)
+        update(rate, reading)
+        q.append(attitude())
+    return chosen, np.array(q, float)
 
 
 def _with_reference(recording: Recording) -> tuple[Recording, Values]:

@@ -52,7 +52,7 @@ from pipeline.physics.formula import c_number
 from pipeline.physics.measurement import FIELDS_OF_SIGNALS, sensor_effects
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from pipeline.core.settings import Settings
 
@@ -60,6 +60,8 @@ TEMPLATES = Path(__file__).parent / "templates"
 # of the fixed point: each gains about two digits, and a relative error of 1e-13 is the goal
 FIXED_POINT_ITERATIONS = 12
 IN_C = set(FIELDS_OF_SIGNALS) - {"specific_force_rate"}
+END_OF_HEADER = "\n---\n"  # of the file of a format
+YAML = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 CALL = re.compile(r"(\w+)\(")  # of a function in C
 
 
@@ -84,6 +86,15 @@ class Format:
     noise: bool = False  # whether it has noise parameters: remarks state their origin, interval, effective density
     error_sentence: str | None = None  # {}: a held-out error; default: of the export or of the full calibration
     read_back: JSON = field(default_factory=dict)  # how ``convert`` reads it (``reading``); empty: no calibration
+
+
+class _Texts(FileSystemLoader):
+    """The texts of templates, for formats those below their declaration."""
+
+    def get_source(self, environment: Environment, template: str) -> tuple[str, str, Callable[[], bool]]:
+        """Return text, file and whether it is unchanged."""
+        text, file, unchanged = super().get_source(environment, template)
+        return text.partition(END_OF_HEADER)[2] if template.endswith(".j2") else text, file, unchanged
 
 
 @cache
@@ -120,10 +131,11 @@ def formats() -> dict[str, tuple[Format, Template]]:
     checks: dict[str, Check] = {key.name: lambda value: value for key in dataclass_fields(Format)}
     check = fields(checks | {"units": each(one_of(*UNIT_FACTORS))}, required)
     formats_by_name: dict[str, tuple[Format, Template]] = {}
+    environment = _environment().overlay(loader=_Texts(TEMPLATES))
     for template in sorted(TEMPLATES.glob("*.j2")):
-        header, _, text = template.read_text(encoding="utf-8").partition("\n---\n")
+        header, _, _ = template.read_text(encoding="utf-8").partition(END_OF_HEADER)
         try:
-            declared = Format(**{"file": template.stem, **check(yaml.safe_load(header))})
+            declared = Format(**{"file": template.stem, **check(yaml.load(header, YAML))})  # noqa: S506  (safe)
         except WrongValueError as wrong:
             raise ConfigurationError(f"{template}: {wrong}. CONTRIBUTING.md names an example") from None
         same = [name for name, (other, _) in formats_by_name.items() if other.file == declared.file]
@@ -131,8 +143,8 @@ def formats() -> dict[str, tuple[Format, Template]]:
             raise ConfigurationError(
                 f"{template}: file: {declared.file} is also the file of {same[0]}.j2. Name another file"
             )
-        formats_by_name[template.stem] = declared, _environment().from_string(text)
-    _environment().get_template("remarks.txt")  # compiled with the formats, whose texts hold it
+        formats_by_name[template.stem] = declared, environment.get_template(template.name)
+    environment.get_template("remarks.txt")  # compiled with the formats, whose texts hold it
     return formats_by_name
 
 
