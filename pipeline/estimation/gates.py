@@ -1,6 +1,6 @@
 """Gates: the evidence that a further effect needs, wherever effects are selected, planned or said to be hidden.
 
-    delta BIC > g   and   m p < 0.01,    g = max(10 or, of a slow effect, 20; 2e-4 G), at most 30
+    delta BIC > g   and   m p < 0.01,    g = max(10 or, of a slow effect, 24; 2e-4 G), at most 30
 
 where p is the p-value of the likelihood ratio, m the number of candidates (Bonferroni), and G the gain in 2 log L of
 the effects that are already selected, whose equations are of first order. A slow effect depends on time and temperature
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pipeline.physics.effects.base import Effect
 
 MIN_DELTA_BIC = 10.0  # "very strong" evidence (Raftery, Sociological Methodology 25, 1995)
-MIN_DELTA_BIC_OF_SLOW = 20.0  # of a slow effect, see above
+MIN_DELTA_BIC_OF_SLOW = 24.0  # of a slow effect, see above
 MAX_MIN_DELTA_BIC = 30.0  # largest delta BIC that is required after effects with a large gain
 ERROR_OF_FIRST_ORDER = 2e-4  # of the gain in 2 log L of effects: the error of their equations of first order
 MAX_FALSE_PROBABILITY = 0.01  # of a false selection by chance, over all candidates
