@@ -205,4 +205,5 @@ def random_motion(seed: int, n: int = 5) -> Motion:
         still=np.zeros(n, bool),
         level=level,
         direction=np.linalg.qr(rng.standard_normal((n, 3, 3)))[0][:, 0],
+        temperature_rate=rng.uniform(-0.1, 0.1, n),
     )

@@ -13,6 +13,7 @@ from pipeline.estimation.gates import possible
 from pipeline.physics.effects import catalogue, effect, stated_priors
 from pipeline.physics.effects.base import parameter_limits
 from pipeline.physics.effects.mounting import SETUP_EFFECTS
+from pipeline.physics.signal.filters import MIN_SWING_DEGC, heats_and_cools
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.observations import Observations
     from pipeline.physics.effects.base import Effect
 
+NO_SWING = f"the temperature does not rise and fall by {MIN_SWING_DEGC:g} degC while it is recorded"
 AUTO = "auto"  # instead of a list of effects: the effects that the diagnosis selects
 MOUNTING, ZERO, TILT = "mounting", "encoder_zero", "table_tilt"
 TILTS = ("d_x", "d_y")  # parameters of ``table_tilt``
@@ -190,7 +192,7 @@ def candidates_for(observations: Observations, configured: Sequence[str]) -> lis
     """Return the effects that could be missing in the model and that the recordings can show."""
     sensor, motions = observations.sensor, [part.motion for part in observations.parts]
     turns, without_temperature = turns_of(observations), any(motion.temperature is None for motion in motions)
-    candidates = []
+    candidates, swings = [], heats_and_cools(motion.temperature for motion in motions)
     for name, listed in catalogue().items():
         this = listed.of_recordings(turns)
         impossible = (
@@ -202,6 +204,7 @@ def candidates_for(observations: Observations, configured: Sequence[str]) -> lis
             or (name == "earth_rotation" and observations.earth)
             or (this.needs_clock and not observations.clock_shared)
             or ("temperature" in this.needs and without_temperature)
+            or (this.needs_swing and not swings)
         )
         if not impossible and any(this.available(motion) for motion in motions):
             candidates.append(this)

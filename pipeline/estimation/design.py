@@ -69,7 +69,7 @@ REMEMBERED = 4  # motions of a part after effects of timing: of the base, and of
 MIN_DESIGN_SINGULAR_VALUE, PART_OF_IT = 1e-3, 0.1
 MOTION_FIELDS = (  # fields of ``Motion`` on which formulas depend
     "time", "specific_force", "angular_rate", "angular_acceleration", "temperature", "angle", "rate", "level",
-    "direction",
+    "direction", "temperature_rate",
 )  # fmt: skip
 Result = TypeVar("Result")
 OTHER_PREFIX = "other_"  # prefix of the names of free curves

@@ -165,7 +165,7 @@ def fit_effects_by_rests(
         chosen = SelectionByHand(model, before, [], noise, data_sheet)
         added = offered(chosen.names, chosen.fit.state.terms, chosen.fit.covariance, data_sheet, sensor)
         parts = [(model.without(rests), rests) for rests in rests_in_turn(model)] if added else []
-        harm = left_out(chosen, parts).harmful(chosen.names) if added else {}
+        harm = left_out(chosen, parts).harmful(chosen.names) if parts else {}
         names = [name for name in added if name not in harm]
     if not names:
         return before

@@ -127,8 +127,9 @@ class LeftOut:
 
 
 def rests_in_turn(model: Model) -> list[Mask]:
-    """Return the rests of a model, every third in turn, as masks."""
-    return [np.arange(len(model.rests.time)) % REST_FOLDS == k for k in range(REST_FOLDS)]
+    """Return the rests of a model, every third in turn, as masks; none where they are too few, as in one soak."""
+    count = len(model.rests.time)
+    return [np.arange(count) % REST_FOLDS == k for k in range(REST_FOLDS if count >= REST_FOLDS else 0)]
 
 
 def left_out(

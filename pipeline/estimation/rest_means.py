@@ -18,7 +18,13 @@ from pipeline.core.records import NOISE_OF_ROWS, RestUse, once
 from pipeline.estimation.turns import stop_and_go
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.physics.kinematics import table_motion
-from pipeline.physics.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
+from pipeline.physics.signal.filters import (
+    filter_autocovariance,
+    heats_and_cools,
+    temperature_of,
+    temperature_rate_of,
+    variance_of_mean,
+)
 from pipeline.physics.signal.quiet_motion import creep_of_rest, posterior_creep_rates, rounding_of, step_and_noise
 from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, usable
 
@@ -29,8 +35,8 @@ if TYPE_CHECKING:
     from pipeline.core.settings import Procedure, Settings, Table
 
 ROLE, HELD_OUT = "rests", "validation"
-SOAK = "soak"  # a kind of recording in the sheet
-OF_ALL = ("clock_shared", "kinds")  # fields of ``Rests`` that are no arrays
+SOAK, ATTITUDES = "soak", "attitudes"  # kinds of recordings in the sheet; times of attitudes do not count
+OF_ALL = ("clock_shared", "kinds", "swings")  # fields of ``Rests`` that are no arrays
 
 
 @dataclass(frozen=True)
@@ -159,10 +165,13 @@ def nearest_to_reference(temperature: Values) -> int:
     return len(off) // 2 if np.isnan(off).all() else int(np.nanargmin(off))
 
 
-def _warmth(recording: Recording, rests: Sequence[Rest]) -> Values:
-    """Return the mean temperature of each rest: (m,) array, degC; NaN where none was recorded."""
-    warmth = np.full(recording.samples, np.nan) if recording.temperature is None else temperature_of(recording)
-    return np.array([warmth[rest.start : rest.stop].mean() for rest in rests])
+def _warmth(recording: Recording, rests: Sequence[Rest]) -> tuple[Values, Values]:
+    """Return the mean temperature of each rest and its mean rate: (m,) arrays, degC and degC/s; NaN for none."""
+    if recording.temperature is None:
+        return np.full(len(rests), np.nan), np.full(len(rests), np.nan)
+    warmth, rate = temperature_of(recording), temperature_rate_of(recording) * (recording.kind != ATTITUDES)
+    warmth, rate = (np.array([v[rest.start : rest.stop].mean() for rest in rests]) for v in (warmth, rate))
+    return warmth, rate
 
 
 def variances_of_means(recording: Recording, counts: Integers, sensor: str) -> tuple[Values, Values]:
@@ -196,7 +205,9 @@ class Rests:
     start: Values
     length: Values
     time: Values
-    temperature: Values  # (m,), degC; NaN where none was recorded
+    # each (m,), degC and degC/s; NaN where none was recorded
+    temperature: Values
+    temperature_rate: Values
     recording: Index  # (m,); index of the recording that each belongs to
     held_out: Mask  # (m,)
     soaked: Mask  # (m,); whether each is a part of a soak
@@ -209,6 +220,7 @@ class Rests:
     creep_about: Values  # (m,), deg/s; standard deviation of the rate about gravity
     clock_shared: bool  # whether the time between the recordings is known
     kinds: frozenset[str] = frozenset()  # of the recordings, in the sheet
+    swings: bool = False  # whether the temperature rises and falls in the recordings
 
     def select(self, index: Mask | slice) -> Self:
         """Return some of the rests."""
@@ -281,7 +293,9 @@ def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, 
     _, rounding = rounding_of([step_and_noise(r, sensor) for r in recordings if r.reading(sensor) is not None])
     columns["rounding"] = np.tile(rounding, (len(columns["time"]), 1))
     shared = len(np.unique(columns["recording"])) == 1 or all(recordings[index].clock_shared for index in chosen)
-    return Rests(**columns, clock_shared=shared, kinds=frozenset(recordings[index].kind for index in chosen))
+    used = [recordings[index] for index in chosen]
+    swings = heats_and_cools(temperature_of(r) for r in used if r.temperature is not None and r.kind != ATTITUDES)
+    return Rests(**columns, clock_shared=shared, kinds=frozenset(r.kind for r in used), swings=swings)
 
 
 @dataclass(frozen=True)
@@ -324,7 +338,7 @@ def orientations_of(recordings: Sequence[Recording], settings: Settings) -> Orie
         on_table = _rests_on_table(recording, settings.table)
         if on_table is None:
             split, soaked = split_rests(recording, every if recording.role == ROLE else 0), recording.kind == SOAK
-            used[i] = [split.used[nearest_to_reference(_warmth(recording, split.used))]] if soaked else split.used
+            used[i] = [split.used[nearest_to_reference(_warmth(recording, split.used)[0])]] if soaked else split.used
             held_out += [(recording, rest) for rest in split.held_out]
             left_out += [(recording, rest) for rest in split.left_out]
         else:
@@ -371,6 +385,7 @@ def _of_recording(recording: Recording, sensor: str, rests: tuple[Rest, ...]) ->
     if sensor == "accelerometer" and by_hand:  # without the tilt of a unit that creeps
         scatter = [c.squares * max(n - 1, 1) / max(c.freedom, 1) for c, n in zip(creeps, counts, strict=True)]
     start = time[span[:, 0]]
+    temperature, warming = _warmth(recording, [Rest(a, b) for a, b in span.tolist()])
     share, own = variances_of_means(recording, counts, sensor)
     return {
         "reading": means,
@@ -381,7 +396,8 @@ def _of_recording(recording: Recording, sensor: str, rests: tuple[Rest, ...]) ->
         "start": start,
         "length": time[span[:, 1] - 1] - start + recording.interval,
         "time": np.array([time[s].mean() for s in inside]),
-        "temperature": _warmth(recording, [Rest(a, b) for a, b in span.tolist()]),
+        "temperature": temperature,
+        "temperature_rate": warming,
         "held_out": np.zeros(len(span), bool),
         "soaked": np.full(len(span), recording.kind == SOAK),
         "span": span,

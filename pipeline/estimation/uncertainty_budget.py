@@ -69,7 +69,7 @@ from pipeline.estimation.candidates import TILT, limits_of, tilt_like_zeros
 from pipeline.estimation.design import EffectColumns, columns_of_samples, joined_motions
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.monte_carlo import through, with_trials
-from pipeline.estimation.multi_position.model import motion_of
+from pipeline.estimation.multi_position.model import motion_at_rests
 from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Owner
@@ -215,8 +215,7 @@ def changes_through_gravity(
     if model.moves is None or not accelerometer.at_limits:
         return {}
     rests, force, M = model.every, model.at_rests.force, accelerometer.matrix
-    motion = motion_of(rests.time, force, np.zeros_like(force), rests.temperature, still=True)
-    motion = _centred([motion])[0]
+    motion = _centred([motion_at_rests(rests, force)])[0]
     by_force = np.einsum("pn,nmc->pmc", gain[:, model.of_moves], model.by_force(fitted.state))
     K = np.asarray(np.linalg.solve(M, np.eye(3)), np.float64)
     found: dict[str, Values] = {}

@@ -15,6 +15,7 @@ The effects are subtracted in three steps:
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from pipeline.physics.measurement import Truths
 
 SMOOTHING_S = 3.0  # 30 samples of a thermometer at 10 Hz; a package warms up in minutes
+RATE_SMOOTHING_S = 10.0  # of the temperature's rate: the largest bandwidth in a fit (``smooth_temperature``)
 BLOCK = 8192  # samples that are computed at once: their arrays stay in the processor's cache
 OF_THE_PAST = {"specific_force_rate", "angular_acceleration", "direction"}
 
@@ -105,6 +107,7 @@ class CompensationStream:
         self._moving = {s: SensorEffects.of(c, self.steps[s].moving) for s, c in calibrations.items()}
         self._linear = {s: SensorEffects.of(c, ()) for s, c in calibrations.items()}
         self._line = ExponentialRegression(smoothing or 1.0)
+        self._slope = ExponentialRegression(max(smoothing, RATE_SMOOTHING_S))
         self._ends = [LogEnd()]  # of the last block, one for each iteration
 
     @property
@@ -150,18 +153,20 @@ class CompensationStream:
         used = set().union(*(step.used for step in steps.values()))
         zeros = np.zeros_like(next(iter(readings.values()))) if used else np.zeros((0, 3))
         clock, warm = arrays.get("time", zeros[:, 0]), arrays.get("temperature")
-        if warm is not None and "time" in arrays and "temperature" in used and self.smoothing > 0:
+        if warm is not None and "time" in arrays and used & {"temperature", "temperature_rate"} and self.smoothing > 0:
             warm = self._line.apply(clock, warm)
+        warming = None
+        if warm is not None and "temperature_rate" in used:
+            warming = self._slope.apply(clock, warm, slope=True)
+        motion_of = partial(log_motion, clock, temperature=warm, temperature_rate=warming)
 
         def true_motion(truths: Truths, number: int) -> Motion:
             force, rate = truths.get("accelerometer", zeros), truths.get("gyroscope", zeros)
             end = self._ends[min(number, len(self._ends) - 1)]
-            return log_motion(clock, specific_force=force, angular_rate=rate, temperature=warm, used=used, end=end)
+            return motion_of(specific_force=force, angular_rate=rate, used=used, end=end)
 
         if any(step.steady for step in steps.values()):
-            room = log_motion(
-                clock, specific_force=zeros, angular_rate=zeros, temperature=warm, used=set(), end=LogEnd()
-            )
+            room = motion_of(specific_force=zeros, angular_rate=zeros, used=set(), end=LogEnd())
             readings |= {s: self._steady[s].take_off(readings[s], room) for s in steps}
         return self._solved(steps, readings, true_motion, used & OF_THE_PAST)
 

@@ -82,6 +82,7 @@ SIGNALS = {
     **_vector("e", "direction", "{axis} component of the unit vector of this or the last turn", "m->direction[{}]"),
     "speed": Signal("magnitude of the angular rate, deg/s", "angular_rate", (), "imu_length(w)"),
     "temperature": Signal("temperature, degC", "temperature", (), "m->temperature"),
+    "temperature_rate": Signal("rate of the temperature, degC/s", "temperature_rate", (), "m->temperature_rate"),
     "time": Signal("time since power-on, s", "time", (), "m->time"),
     "rate": Signal("rate of the table about its turn axis, deg/s", "rate"),
     "angle": Signal("angle of the table about its turn axis, deg", "angle"),

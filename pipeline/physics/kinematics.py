@@ -53,7 +53,7 @@ from pipeline.core.records import (
     once_of_log,
 )
 from pipeline.physics.signal.encoder_rate import rate_by_angle, step_of
-from pipeline.physics.signal.filters import temperature_of
+from pipeline.physics.signal.filters import temperature_of, temperature_rate_of
 from pipeline.physics.signal.rests import still_samples
 
 if TYPE_CHECKING:
@@ -348,11 +348,12 @@ def _reference_motion(
             f"recording {recording.name} has {recording.samples} samples; at least 6 are needed to follow the table",
             recording.source.get("file"),
         )
-    temperature = None if recording.temperature is None else temperature_of(recording)
+    warm = recording.temperature is not None
     own_clock = "table" if "table_clock" in recording.source else "sensor"
     logged = partial(
         replace,
-        temperature=temperature,
+        temperature=temperature_of(recording) if warm else None,
+        temperature_rate=temperature_rate_of(recording) if warm else None,
         timed_by=own_clock if recording.table_rate is None else "",
         recording=recording.name,
         setup=recording.setup,

@@ -19,7 +19,8 @@ The temperature is smoothed by a line with exponentially decaying weights (expon
 
     T(t) = a,  (a, b) = argmin sum_i exp((t_i - t) / h) (T_i - a - b (t_i - t))^2,    t_i <= t
 
-where h is the memory, s. A ramp passes without lag, and the noise of the thermometer is averaged. Time is divided into
+where h is the memory, s. A ramp passes without lag, and the noise of the thermometer is averaged. The rate of the
+temperature is the slope b of another such line, through the smoothed temperature. Time is divided into
 stretches of 4 h. The line follows from five sums, taken about the start ``o`` of the stretch of the sample:
 
     S_k = sum_i exp((t_i - o) / h) (t_i - o)^k,   k = 0, 1, 2;    R_k likewise with T_i - 25 degC,   k = 0, 1
@@ -60,6 +61,7 @@ DEGENERATE = 1e-15  # determinant over its scale, below which doubles do not res
 FIELDS_OF_SIGNALS = {
     "time": {"time"},
     "temperature": {"temperature"},
+    "temperature_rate": {"temperature", "time"},
     "specific_force": {"accelerometer"},
     "specific_force_rate": {"accelerometer", "time"},
     "angular_rate": {"gyroscope"},
@@ -208,6 +210,7 @@ def log_motion(
     specific_force: Values,
     angular_rate: Values,
     temperature: Values | None,
+    temperature_rate: Values | None,
     used: set[str],
     end: LogEnd,
 ) -> Motion:
@@ -229,6 +232,7 @@ def log_motion(
         rate=None,
         axis=None,
         still=np.zeros(len(time), bool),
+        temperature_rate=temperature_rate,
     )
     if "direction" not in used:
         return motion
@@ -285,9 +289,10 @@ class ExponentialRegression:
         self._stretch = float("nan")
         self._sums = np.zeros(5)
 
-    def apply(self, time: Values, temperature: Values) -> Values:
+    def apply(self, time: Values, temperature: Values, *, slope: bool = False) -> Values:
         """Return the line at each sample: (n,) array, degC; also where the temperature is missing (NaN).
 
+        ``slope``: return the slope of the line, degC/s; 0 as long as one temperature is known.
         Raises ``InputError`` if time goes back by more than ``MAX_MEMORIES_BACK`` memories.
         """
         stretch = np.floor(time / (STRETCH * self.memory))
@@ -295,7 +300,7 @@ class ExponentialRegression:
         out = np.empty(len(time))
         for start, end in itertools.pairwise([0, *cuts.tolist(), len(time)]):
             self._move(float(stretch[start]), float(time[start]))
-            out[start:end] = self._along(time[start:end], temperature[start:end])
+            out[start:end] = self._along(time[start:end], temperature[start:end], slope=slope)
         return out
 
     def _move(self, stretch: float, time: float) -> None:
@@ -310,8 +315,8 @@ class ExponentialRegression:
         moved = (s0, s1 - step * s0, s2 - 2.0 * step * s1 + step * step * s0, r0, r1 - step * r0)
         self._sums = np.exp(-step / self.memory) * np.array(moved)
 
-    def _along(self, time: Values, temperature: Values) -> Values:
-        """Return the line within a stretch; from one known sample, its temperature."""
+    def _along(self, time: Values, temperature: Values, *, slope: bool) -> Values:
+        """Return the line, or its slope, within a stretch; from one known sample, its temperature."""
         since = time - self._stretch * (STRETCH * self.memory)
         missing = np.isnan(temperature)
         excess = np.where(missing, 0.0, temperature - REFERENCE_TEMPERATURE)
@@ -324,6 +329,10 @@ class ExponentialRegression:
         first, second = s1 - since * s0, s2 - 2.0 * since * s1 + since * since * s0
         determinant = s0 * second - first * first
         sloping = determinant > DEGENERATE * s0 * s0 * self.memory * self.memory
+        if slope:
+            rate = np.where(s0 > 0, 0.0, np.nan)
+            np.divide(s0 * (r1 - since * r0) - first * r0, determinant, out=rate, where=sloping)
+            return rate
         value = np.divide(r0, s0, out=np.full(len(since), np.nan), where=s0 > 0)
         np.divide(second * r0 - first * (r1 - since * r0), determinant, out=value, where=sloping)
         return np.asarray(value + REFERENCE_TEMPERATURE, np.float64)

@@ -128,7 +128,8 @@ def _open(
 ) -> Iterator[tuple[str, Values, str]]:
     """Yield name, largest change of bias and matrix, (12,), and reason of each open effect.
 
-    A change by a contained effect that the recordings show is not open.
+    A change by a contained effect that the recordings show is not open. Nor is an effect that is proportional to one
+    that they show and that is not in the model, such as a lag of the thermometer where the bias does not depend on it.
     """
     reasons: dict[str, str] = {}
     for name in calibration.at_limits:
@@ -137,6 +138,11 @@ def _open(
         reason = NOT_DIAGNOSED if of_sensor is None else of_sensor.get(plain)
         if reason:
             reasons[name] = reason
+    for name in [*reasons]:
+        owner, _, plain = name.rpartition(".")
+        other = f"{owner}.{effect(plain).scales_with}".lstrip(".")
+        if other in calibration.at_limits and other not in reasons:
+            del reasons[name]
     fitted = {e.name for e in calibration.effects}
     contained = {f"{name.rpartition('.')[0]}.{other}".lstrip(".") for name in reasons
                  for other in effect(name.rpartition(".")[2]).contains}  # fmt: skip

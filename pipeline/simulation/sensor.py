@@ -54,6 +54,7 @@ from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import SENSORS, Motion
 from pipeline.physics.effects import effect, effect_from
 from pipeline.physics.effects.base import STANDARD_GRAVITY, parameter_limits, truth
+from pipeline.physics.signal.filters import rate_of_change
 from pipeline.physics.signal.rests import still_samples
 from pipeline.simulation.trajectory import CommandedTurns, mounted, rotation_about, rotation_by
 
@@ -111,6 +112,7 @@ class Scene:
         return replace(motion, time=time, at_offset=lambda offset=0.0: self.motion(time + offset, temperature))
 
     def _without_lag(self, time: Values, temperature: Values | None) -> Motion:
+        warming = None if temperature is None else rate_of_change(time, temperature)
         pose = mounted(self.trajectory.pose(time - self.start), self.mounting)
         gravity = self.gravity * (self.up @ pose.level)
         force = gravity
@@ -128,6 +130,7 @@ class Scene:
             angular_acceleration=pose.alpha,
             specific_force_rate=-np.cross(np.radians(pose.omega), gravity),
             temperature=temperature,
+            temperature_rate=warming,
             angle=pose.angle,
             rate=pose.rate,
             axis=self.axis,

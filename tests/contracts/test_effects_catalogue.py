@@ -23,6 +23,7 @@ BOTH = [
     "bias_temperature",
     "bias_temperature_quadratic",
     "bias_temperature_cubic",
+    "temperature_lag",
     "scale_factor_temperature",
     "warm_up",
     "scale_factor_asymmetry",

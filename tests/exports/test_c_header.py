@@ -42,7 +42,10 @@ ALGEBRA = {
         "g_squared_sensitivity": 0.02,
     },
 }
-LIBRARY = {"accelerometer": {"hysteresis": 2e-3, "warm_up": 1e-2}, "gyroscope": {"warm_up": 0.5}}
+LIBRARY = {
+    "accelerometer": {"hysteresis": 2e-3, "warm_up": 1e-2},
+    "gyroscope": {"warm_up": 0.5, "temperature_lag": 0.05},
+}
 IN_TURN = {"accelerometer": {"cubic_nonlinearity": 4e-3}, "gyroscope": {"g_sensitivity": 0.1}}
 LEVERS = {"accelerometer": {"inner_lever_arms": 5e-3}, "gyroscope": {"scale_factor_asymmetry": 2e-3}}
 ONE_ROUND = {"accelerometer": {"inner_lever_arms": 5e-3}, "gyroscope": {"bias_temperature": 0.1}}
@@ -160,7 +163,8 @@ def test_what_looks_at_the_time_or_the_past_is_left_out_of_a_sample_by_itself(tm
     found = compiled(tmp_path, document(LIBRARY), "double", alone=True)
     np.testing.assert_array_equal(found, in_python(tmp_path, document({}), alone=True))
     assert (
-        "without hysteresis, warm_up, which time or the sample before tells" in (tmp_path / "calibration.h").read_text()
+        "without hysteresis, temperature_lag, warm_up, which time or the sample before tells"
+        in (tmp_path / "calibration.h").read_text()
     )
 
 

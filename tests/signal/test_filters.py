@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from unit_settings import filter_of
 
 from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.records import Recording
-from pipeline.physics.signal.filters import apply_filter, smooth_temperature
+from pipeline.physics.signal.filters import apply_filter, heats_and_cools, smooth_temperature, temperature_rate_of
 
 CONFIGS = Path(__file__).parents[2] / "configs/filter"
 FILTERS = ["rc_low_pass", "low_pass", "high_pass", "band_pass", "band_stop"]
@@ -249,3 +250,24 @@ def test_coarse_counts_are_not_taken_for_corners() -> None:
     assert np.abs(smooth_temperature(TIME, coarse) - truth).max() < 0.05
     constant = np.full_like(TIME, 21.5)
     np.testing.assert_allclose(smooth_temperature(TIME, constant), constant, rtol=1e-12)
+
+
+def test_the_rate_of_the_temperature_is_that_of_the_smoothed_one() -> None:
+    truth, rate = 25.0 + 3.0 * np.sin(TIME / 60.0), 0.05 * np.cos(TIME / 60.0)
+    recording = replace(_recording(np.zeros(len(TIME)), time=TIME), temperature=read(truth, 1))
+    off = temperature_rate_of(recording) - rate
+    assert np.sqrt(np.mean(off[100:-100] ** 2)) < 0.1 * np.abs(rate).max()
+
+
+@pytest.mark.parametrize(
+    ("temperatures", "expected"),
+    [
+        ([[20.0, 21.5, 20.2]], True),
+        ([[20.0, 22.0], [22.0, 20.0]], True),  # each in a recording of its own
+        ([[20.0, 25.0, 24.5]], False),  # cools by half a degree
+        ([[20.0, 25.0], None, []], False),
+        ([[25.0, 20.0], [20.0, 15.0]], False),
+    ],
+)
+def test_a_temperature_heats_and_cools_by_a_degree_or_it_does_not(temperatures: Any, *, expected: bool) -> None:
+    assert heats_and_cools(None if t is None else np.array(t) for t in temperatures) is expected

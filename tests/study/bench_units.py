@@ -78,7 +78,8 @@ def drawn(
             "zero_deg": dict.fromkeys(TURNS, float(rng.uniform(-180.0, 180.0))),
         }
     sensor = str(of_unit.choice(SENSORS))
-    possible = {n: e for n, e in built_in().items() if n not in NOT_HIDDEN and not e.shown_by}  # no table shows these
+    no_chamber = {n: e for n, e in built_in().items() if not (e.shown_by or e.needs_swing)}
+    possible = {n: e for n, e in no_chamber.items() if n not in NOT_HIDDEN}
     names = [n for n, e in possible.items() if sensor in e.sensors and sensor not in e.unseen]
     effect = str(of_unit.choice(names)) if of_unit.random() < hidden else ""
     table = "acutronic" if KINDS[kind] == "plain" else "single_axis"

@@ -402,8 +402,8 @@ class PlanGain:
 def best_changes(unit: UnitDescription, before: Document) -> list[PlanGain]:
     """Return the gain of each change, the most helpful first; ``before`` is the plan of the unit's procedure.
 
-    The order is by the number of effects that become observable for each additional minute (at least one, to set up),
-    then by the reduction of the smallest sizes for each minute, as a logarithm.
+    The order is by the number of effects that become observable, in one sensor or both, for each additional minute (at
+    least one, to set up), then by the reduction of the smallest sizes for each minute, as a logarithm.
     """
     if all(before[sensor]["reason"] for sensor in SENSORS):
         return []
@@ -411,7 +411,7 @@ def best_changes(unit: UnitDescription, before: Document) -> list[PlanGain]:
 
     def order(gain: PlanGain) -> tuple[float, float]:
         minutes = max(gain.minutes, 1.0)
-        return -len(gain.shown) / minutes, float(np.log(gain.factor)) / minutes
+        return -len({key.partition(".")[2] for key in gain.shown}) / minutes, float(np.log(gain.factor)) / minutes
 
     return sorted(gains, key=order)
 

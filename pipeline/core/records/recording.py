@@ -304,6 +304,7 @@ class Motion:
     timed_by: str = ""  # clock of the angle that gives the rate, "sensor" or "table"; empty: logged rate
     recording: str = ""
     setup: str = ""  # table, mounting or session of the recording; empty if the unit has only one
+    temperature_rate: Values | None = None  # (n,), degC/s, of the smoothed temperature; known where that is
 
     def select(self, index: NDArray[Any]) -> Motion:
         """Return the motion at some samples (a mask or integers), without the trajectory between samples."""

@@ -44,7 +44,7 @@ from pipeline.estimation.multi_position.model import (
     State,
     effect_readings,
     limit_block,
-    motion_of,
+    motion_at_rests,
     stacked,
 )
 from pipeline.estimation.rest_means import HELD_OUT, Rests, nearest_to_reference, rests_of
@@ -52,7 +52,7 @@ from pipeline.estimation.rest_means import HELD_OUT, Rests, nearest_to_reference
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.core.records import Index, Mask, Motion, Noise, Recording, SensorCalibration, Values
+    from pipeline.core.records import Index, Mask, Noise, Recording, SensorCalibration, Values
     from pipeline.core.settings import DataSheet, Settings
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.model import State
@@ -81,8 +81,7 @@ class Soaks:
         rests, first = self.rests, self.reference
         variance, of_first = (r.variance(white) for r in (rests, first))
         error = np.sqrt(variance + of_first[self.of])
-        at = motion_of(rests.time, force[self.of], np.zeros_like(rests.reading), rests.temperature, still=True)
-        there = motion_of(first.time, force, np.zeros_like(force), first.temperature, still=True)
+        at, there = motion_at_rests(rests, force[self.of]), motion_at_rests(first, force)
         z, z_first = (effect_readings("accelerometer", state.terms, motion, state.K) for motion in (at, there))
         residual = (rests.reading - first.reading[self.of] - z + z_first[self.of]) / error
         k, s = len(rests.time), len(first.time)
@@ -174,7 +173,7 @@ class AccelerometerModel:
         variance = rests.variance(self.white)
         error = np.sqrt(np.sum(along**2 * variance, axis=1))
         target = np.sqrt(self.gravity**2 + 2.0 * (rests.share * np.mean(self.white**2) + rests.own))
-        motion = self._motion(self.gravity * n, rests)
+        motion = motion_at_rests(rests, self.gravity * n)
         base = np.concatenate([-along, (n[:, :, None] * v[:, None, :]).reshape(-1, 9)], axis=1)
 
         def effect_columns(term: EffectColumns) -> Values:
@@ -218,7 +217,7 @@ class AccelerometerModel:
         force = v @ state.matrix.T
         for _ in range(FORCE_ITERATIONS if state.terms else 0):
             size = np.linalg.norm(force, axis=1, keepdims=True)
-            motion = self._motion(self.gravity * force / size, rests)
+            motion = motion_at_rests(rests, self.gravity * force / size)
             v = rests.reading - state.bias - effect_readings(self.sensor, state.terms, motion, K)
             before, force = force, v @ state.matrix.T
             if np.abs(force - before).max() < SETTLED_FORCE_G:
@@ -254,9 +253,6 @@ class AccelerometerModel:
             known_by_limit=self.known_by_limit,
             soaks=self.soaks,
         )
-
-    def _motion(self, force: Values, rests: Rests) -> Motion:
-        return motion_of(rests.time, force, np.zeros_like(force), rests.temperature, still=True)
 
 
 def white_of(rests: Rests, noise: Noise | None) -> Values:

@@ -38,6 +38,7 @@ from pipeline.estimation.multi_position.model import EquationBlock, State, effec
 from pipeline.estimation.multi_position.moves import padded, sound_span, spans_between, tangents, trapezoids
 from pipeline.estimation.rest_means import ROLE, Rests
 from pipeline.physics.kinematics import skew
+from pipeline.physics.signal.filters import temperature_rate_of
 from pipeline.physics.signal.segments import AXIS_ACCURACY, LOGGED_TURNS, MAX_AXIS_SINE, SCALE, multiples
 
 if TYPE_CHECKING:
@@ -298,9 +299,10 @@ class TurnsByHand:
     # each (t, s, 3), deg/s and g; angular rate as it was read; specific force by the calibrated accelerometer
     reading: Values
     force: Values
-    # each (t, s), s and degC
+    # each (t, s), s, degC and degC/s
     time: Values
     temperature: Values
+    temperature_rate: Values
     weight: Values  # (t, s), s; in an integral by the trapezoidal rule; 0 beyond a turn's end
     rows: Values  # (r, t, 3); weights of Phi in the equations
     # each (r,), deg; of the equations, and standard uncertainty
@@ -394,7 +396,7 @@ class TurnsByHand:
         """Return the motion of all samples, and ``v = y - b - z``."""
         plain = self.reading - state.bias
         force, rate = self.force.reshape(-1, 3), (plain @ state.matrix.T).reshape(-1, 3)
-        motion = motion_of(self.time.ravel(), force, rate, self.temperature.ravel(), still=False)
+        motion = motion_of(self, force, rate, still=False)
         return motion, plain - effect_readings("gyroscope", state.terms, motion, state.K).reshape(plain.shape)
 
 
@@ -430,7 +432,9 @@ def _gathered(
         else (r.accelerometer[at] - accelerometer.bias) @ accelerometer.matrix.T
         for r, at in pairs
     ]
-    warmth = [np.full(len(at), np.nan) if r.temperature is None else r.temperature[at] for r, at in pairs]
+    unknown = np.full(len(pairs[0][1]), np.nan)
+    warmth = [unknown if r.temperature is None else r.temperature[at] for r, at in pairs]
+    warming = [unknown if r.temperature is None else temperature_rate_of(r)[at] for r, at in pairs]
     times = np.array([r.time[at] for r, at in pairs])
     direction, stated = np.array([t.direction for t in chosen]), np.array([t.angle for t in chosen])
     cosine = direction @ direction.T
@@ -454,6 +458,7 @@ def _gathered(
         force=np.array(force),
         time=times,
         temperature=np.array(warmth),
+        temperature_rate=np.array(warming),
         weight=trapezoids(times),
         rows=np.array(rows),
         value=np.array(value),

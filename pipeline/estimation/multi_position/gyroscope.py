@@ -41,6 +41,7 @@ from pipeline.estimation.multi_position.model import (
     State,
     effect_readings,
     limit_block,
+    motion_at_rests,
     motion_of,
     stacked,
 )
@@ -239,7 +240,7 @@ class GyroscopeModel:
 
     def _rate_at_rest(self, rests: Rests, force: Values, state: State) -> tuple[Values, Motion]:
         """Return the readings at rests minus those that the model predicts, (m, 3), and the motion."""
-        motion = motion_of(rests.time, force, np.zeros_like(force), rests.temperature, still=True)
+        motion = motion_at_rests(rests, force)
         predicted = state.bias + effect_readings(self.sensor, state.terms, motion, state.K) + rests.creep @ state.K.T
         return rests.reading - predicted, motion
 
@@ -354,8 +355,7 @@ class GyroscopeModel:
         assert moves is not None  # noqa: S101
 
         def motion_at(rate: Values, force: Values) -> Motion:
-            signals = moves.time.ravel(), force.reshape(-1, 3), rate.reshape(-1, 3), moves.temperature.ravel()
-            return motion_of(*signals, still=False)
+            return motion_of(moves, force.reshape(-1, 3), rate.reshape(-1, 3), still=False)
 
         def integrated(rate: Values) -> tuple[Values, Values]:
             A = to_the_end(rate, moves.time)

@@ -47,7 +47,10 @@ if TYPE_CHECKING:
     from imu_logs.log import Values
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
+    from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
+    from pipeline.estimation.multi_position.moves import Moves
+    from pipeline.estimation.rest_means import Rests
 
 
 Model: TypeAlias = "AccelerometerModel | GyroscopeModel"
@@ -261,16 +264,26 @@ def stepped(model: Model, state: State, step: Values) -> tuple[State, Values]:
     return moved, np.concatenate([step[:count], taken])
 
 
-def motion_of(time: Values, force: Values, rate: Values, temperature: Values, *, still: bool) -> Motion:
-    """Return the motion with the unit's calibrated signals; derivatives are zero."""
-    nothing = np.zeros_like(force)
+def motion_at_rests(rests: Rests, force: Values) -> Motion:
+    """Return the motion at rests with the specific force (m, 3), g."""
+    return motion_of(rests, force, np.zeros_like(force), still=True)
+
+
+def motion_of(part: Rests | Moves | TurnsByHand, force: Values, rate: Values, *, still: bool) -> Motion:
+    """Return the motion of rests, or of the samples of moves or turns, by calibrated signals (n, 3).
+
+    Derivatives of the motion are zero.
+    """
+    time, temperature, warming = (values.ravel() for values in (part.time, part.temperature, part.temperature_rate))
+    warm, nothing = not np.isnan(temperature).any(), np.zeros_like(force)
     return Motion(
         time=time,
         specific_force=force,
         angular_rate=rate,
         angular_acceleration=nothing,
         specific_force_rate=nothing,
-        temperature=None if np.isnan(temperature).any() else temperature,
+        temperature=temperature if warm else None,
+        temperature_rate=warming if warm else None,
         angle=None,
         rate=None,
         axis=None,

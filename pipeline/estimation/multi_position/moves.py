@@ -44,7 +44,7 @@ import numpy as np
 
 from pipeline.core.records import BASE, BASE_COUNT, BIAS, MATRIX, matrix_of
 from pipeline.estimation.engine import root_of
-from pipeline.estimation.multi_position.model import motion_of
+from pipeline.estimation.multi_position.model import motion_at_rests
 from pipeline.estimation.rest_means import ROLE, Rests, rest_means, rests_of, sound_samples
 from pipeline.physics.effects import effect
 from pipeline.physics.kinematics import turn_by_vector
@@ -82,8 +82,9 @@ class Moves:
     # (k, s, 3), deg/s; minus the error of the trapezoidal rule by bends between samples; the last sample is repeated
     reading: Values
     time: Values  # (k, s), s
-    # (k, s), degC; interpolated between the rests before and after; NaN where none was recorded
+    # each (k, s), degC and degC/s; interpolated between the rests before and after; NaN where none was recorded
     temperature: Values
+    temperature_rate: Values
     weight: Values  # (k, s), s; 0 beyond a move's end
     # (k, s, 3), deg; standard uncertainty of the angle in the readings' axes by bends that share a sample, along one
     # direction each
@@ -134,9 +135,11 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
     weight = trapezoids(time)
     excess, doubt = _bends(reading, weight, BENT_RATE_RATIO * float(np.linalg.norm(rests.white)))
     share = (time - rests.time[before][:, None]) / (rests.time[after] - rests.time[before])[:, None]
-    warm = rests.temperature[before][:, None]
-    temperature = warm + share * (rests.temperature[after][:, None] - warm)
-    return Moves(before, after, reading - excess, time, temperature, weight, doubt)
+    warmth, warming = (
+        values[before][:, None] + share * (values[after] - values[before])[:, None]
+        for values in (rests.temperature, rests.temperature_rate)
+    )
+    return Moves(before, after, reading - excess, time, warmth, warming, weight, doubt)
 
 
 def clipped_moves(recordings: Sequence[Recording], rests: Rests) -> str:
@@ -334,8 +337,7 @@ def gravity_of(
     effects = [e for e in accelerometer.effects if not effect(e.name).moves]
 
     def force_of(reading: Values) -> Values:
-        motion = motion_of(rests.time, reading, np.zeros_like(reading), rests.temperature, still=True)
-        return compensate(accelerometer, reading, motion, effects)
+        return compensate(accelerometer, reading, motion_at_rests(rests, reading), effects)
 
     white = float(np.mean(rests.white**2))
     force = force_of(rests.reading)

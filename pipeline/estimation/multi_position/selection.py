@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.estimation.candidates import limits_of, starts_of, time_constants
+from pipeline.estimation.candidates import NO_SWING, limits_of, starts_of, time_constants
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.evidence import CandidateProblem, linear_problem
 from pipeline.estimation.gates import MIN_DELTA_BIC, passes
@@ -32,6 +32,7 @@ from pipeline.estimation.multi_position.fit import (
     SMALL_LAST_STEP,
     FitByHand,
     fit,
+    judged_curves,
     log_determinants,
     project_out,
 )
@@ -39,7 +40,7 @@ from pipeline.estimation.multi_position.model import Model, NoiseHypothesis, Sta
 from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import Score, without
 from pipeline.estimation.selection import MAX_SELECTED_EFFECTS
-from pipeline.physics.effects import catalogue, effect
+from pipeline.physics.effects import catalogue, effect, effect_from
 from pipeline.physics.effects.base import Effect, Owner
 
 if TYPE_CHECKING:
@@ -54,6 +55,9 @@ if TYPE_CHECKING:
 MAX_SELECTION_ROUNDS = 3 * MAX_SELECTED_EFFECTS
 POSSIBLE = 10.0  # times its limits, beyond which an effect is no explanation
 MAX_TIMES_LIMIT = 5.0  # times its limits, which bound an amplitude that a time constant leaves undetermined
+LAG = "temperature_lag"
+FEWEST_PARTS = 8  # of a soak that heats and cools
+TURNING = 0.2  # of the largest rate of the temperature: where it turns round
 COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to its optimum
 
 
@@ -116,6 +120,20 @@ class SelectionByHand:
         self.bounds = {n: MAX_TIMES_LIMIT * limit for n, limit in self.limits.items() if effect(n).nonlinear}
         self.base = fit_configured(model, start, configured, self.hypotheses, self.bounds, small)
         self.ceilings = self.base.equations.ceilings(self.hypotheses)
+        self._search()
+        if LAG in self.names and self._is_hysteresis():
+            self.candidates = [e for e in self.candidates if e.name != LAG]
+            self._search()
+        parts = [self._fitted(self.names[:count]) for count in range(1, len(self.names))]
+        self.fits = [self.base, *parts, self.fit] if self.names else [self.base]
+
+    @cached_property
+    def own(self) -> dict[str, CandidateScores]:
+        """For each selected effect, the scores given all others."""
+        return {name: self._without(name) for name in self.names}
+
+    def _search(self) -> None:
+        """Select from the candidates."""
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
         self.fit = self.base
@@ -129,13 +147,16 @@ class SelectionByHand:
             elif not self._exchange():
                 break
             self.last = self._scored(self.names)
-        parts = [self._fitted(self.names[:count]) for count in range(1, len(self.names))]
-        self.fits = [self.base, *parts, self.fit] if self.names else [self.base]
 
-    @cached_property
-    def own(self) -> dict[str, CandidateScores]:
-        """For each selected effect, the scores given all others."""
-        return {name: self._without(name) for name in self.names}
+    def _is_hysteresis(self) -> bool:
+        """Return whether thermal hysteresis explains the soaks better than the lag that is selected."""
+        loop, lag = hysteresis_of(self.model), next(t for t in self.fit.state.terms if t.effect.name == LAG)
+        if loop is None:
+            return False
+        names = [name for name in self.names if name != LAG]
+        equations = self.model.equations(self._state(names), [lag, loop])
+        by_lag, by_loop = judged_curves(equations, self.hypotheses)
+        return by_loop[0] > by_lag[0]
 
     def _scored(self, names: Sequence[str]) -> CandidateScores:
         """Score every effect given base, configured and some of the selected effects."""
@@ -298,6 +319,18 @@ class SelectionByHand:
         return False
 
 
+def hysteresis_of(model: Model) -> EffectColumns | None:
+    """Return what thermal hysteresis adds to soaks that heat and cool, with the sign of dT/dt; None without any."""
+    soaks = getattr(model, "soaks", None)
+    parts = [soaks.rests, soaks.reference] if soaks else [model.rests.select(model.rests.soaked)]
+    rate = np.concatenate([np.zeros(0), *(part.temperature_rate for part in parts)])
+    if not model.rests.swings or len(rate) < FEWEST_PARTS or np.isnan(rate).any():
+        return None
+    terms = {"h": {"formula": f"tanh(temperature_rate / {TURNING * float(np.abs(rate).max())!r})", "unit": "1"}}
+    effect = {"name": "loop", "owner": "recording", "sensors": [model.sensor], "terms": terms, "meaning": "Hysteresis."}
+    return EffectColumns(effect_from(effect, "a test of the residual"), np.zeros(3))
+
+
 def _nonlinear(candidate: Effect, sensor: str) -> Mask:
     """Return which parameters of an effect are not linear: (p,) array."""
     return np.array([p.name in candidate.nonlinear for p in candidate.parameters(sensor)])
@@ -312,6 +345,7 @@ def refusal(candidate: Effect, sensor: str, rests: Rests) -> str:
         (candidate.owner == Owner.TABLE or candidate.moves, "there is no table"),
         (candidate.owner == Owner.MOUNTING, "by hand the heading of the unit and the centre of its turns are unknown"),
         ("temperature" in candidate.needs and np.isnan(rests.temperature).any(), "the recordings hold no temperature"),
+        (candidate.needs_swing and not rests.swings, NO_SWING),
         (bool(unknown), f"without a table {' and '.join(unknown)} cannot be known"),
         (candidate.needs_clock and not rests.clock_shared, "the time between the recordings is not known"),
     ]

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -42,7 +42,7 @@ from pipeline.estimation.multi_position.fit import (
 )
 from pipeline.estimation.multi_position.model import NoiseHypothesis
 from pipeline.estimation.multi_position.result import calibration_of
-from pipeline.estimation.multi_position.selection import SelectionByHand, posterior
+from pipeline.estimation.multi_position.selection import SelectionByHand, hysteresis_of, posterior
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stages import is_given
 from pipeline.evaluation.diagnosis import functional_forms as forms
@@ -51,23 +51,20 @@ from pipeline.evaluation.diagnosis.method_errors import given_differences
 from pipeline.evaluation.diagnosis.observability import MORE_RESTS, never_shown, not_observable_by_hand
 from pipeline.evaluation.diagnosis.residual_dependence import added_variable_of_rests, significant
 from pipeline.evaluation.diagnosis.verdict import verdict_of_selection_by_hand
-from pipeline.evaluation.diagnosis.words import HYSTERESIS, LAG, listed, plain
+from pipeline.evaluation.diagnosis.words import HYSTERESIS, listed, plain
 from pipeline.physics.effects import catalogue, effect_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.core.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
+    from pipeline.core.records import Mask, Noise, Recording, SensorCalibration
     from pipeline.core.settings import Settings
     from pipeline.estimation.multi_position.model import Equations, Model
-    from pipeline.physics.effects.base import Effect
 
 NEEDED_RECORDING = MORE_RESTS
 WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"
 LEAST_SPAN = 1.0  # s or degC: of a covariate
 FORCE = ("8 * u ** 4 - 8 * u ** 2 + 1", "16 * u ** 5 - 20 * u ** 3 + 5 * u")  # Chebyshev polynomials of u in g
-FEWEST_PARTS = 8  # of a soak that heats and cools
-BOTH_WAYS, TURNING = 0.3, 0.2  # of the largest rate of the temperature: least of the other sense; where it turns round
 WORTH = 0.25  # least share of the residual's mean square that a possible cause explains at its limits
 MAX_NAMED_EFFECTS = 3  # effects in a sentence
 FIRM = 2.0  # times the noise: a larger scatter of the rests is reported
@@ -267,46 +264,12 @@ def _folds(
 ) -> list[tuple[SelectionByHand, Mask]]:
     """Return the selections that leave out every third rest in turn, each with the rests left out.
 
-    Empty if nothing was selected, or if there is a recording for validation.
+    Empty if nothing was selected, if there is a recording for validation, or with too few rests, as in one soak.
     """
     model = selection.model
     if not selection.names or len(model.held_out_squares(selection.fits[0].state)):
         return []
     return [(select(model.without(rests)), rests) for rests in rests_in_turn(model)]
-
-
-class _Curve(NamedTuple):
-    """A curve of time that a test adds to each axis; used as an effect."""
-
-    time: Values  # (k,), s
-    values: Values  # (k,)
-
-    def columns(self, _sensor: str, motion: Motion, _K: Values, _values: Values) -> Values:
-        """Return the columns at the times of a motion: (n, 3, 3) array."""
-        return np.interp(motion.time, self.time, self.values)[:, None, None] * np.eye(3)
-
-
-def _heating_and_cooling(model: Model) -> list[tuple[str, EffectColumns]]:
-    """Return what a thermometer that lags, and hysteresis, add where one soak both heats and cools; else nothing.
-
-    A thermometer that lags by tau behind the sensor adds ``tau db/dT dT/dt``; hysteresis has the sign of dT/dt.
-    """
-    soaks = getattr(model, "soaks", None)
-    parts = [soaks.rests, soaks.reference] if soaks else [model.rests.select(model.rests.soaked)]
-    time, temperature, recording = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "temperature", "recording")
-    )
-    if len(np.unique(recording)) != 1 or len(time) < FEWEST_PARTS or np.isnan(temperature).any():
-        return []
-    order = np.argsort(time)
-    rate = np.gradient(temperature[order], time[order])
-    largest = float(np.abs(rate).max())
-    if max(rate.max(), 0.0) < BOTH_WAYS * largest or max(-rate.min(), 0.0) < BOTH_WAYS * largest:
-        return []
-    shapes = {LAG: rate / largest, HYSTERESIS: np.tanh(rate / (TURNING * largest))}
-    return [
-        (name, EffectColumns(cast("Effect", _Curve(time[order], shape)), np.zeros(3))) for name, shape in shapes.items()
-    ]
 
 
 def _dependences(selection: SelectionByHand) -> list[Dependence]:
@@ -329,16 +292,17 @@ def _dependences(selection: SelectionByHand) -> list[Dependence]:
         effect = {"name": f"curves_of_{covariate}", "owner": "recording", "sensors": [model.sensor], "terms": terms}
         definition = effect_from({**effect, "meaning": "Curves."}, "a test of the residual")
         curves.append(EffectColumns(definition, np.zeros(3 * len(formulas))))
-    for covariate, curve in _heating_and_cooling(model):
-        tests.append((covariate, ()))
-        curves.append(curve)
+    loop = hysteresis_of(model)
+    if loop is not None:
+        tests.append((HYSTERESIS, ()))
+        curves.append(loop)
     equations = model.equations(selection.fits[-1].state, curves)
     possible = selection.ceilings > selection.fits[-1].log_likelihood - CEILING_TO
     hypotheses = [selection.hypotheses[i] for i in np.flatnonzero(possible)]
     judged = judged_curves(equations, hypotheses)
     results = [(covariate, delta, p) for (covariate, _), (delta, p) in zip(tests, judged, strict=True)]
     found = [Dependence(name, p) for name, (_, p) in significant(results).items()]
-    return found[:1] if found and found[0].covariate in {LAG, HYSTERESIS} else found
+    return found[:1] if found and found[0].covariate == HYSTERESIS else found
 
 
 def _suspects(selection: SelectionByHand, hidden: Mapping[str, str]) -> list[str]:

@@ -21,10 +21,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.candidates import MOUNTING, ZERO
+from pipeline.estimation.candidates import MOUNTING, NO_SWING, ZERO
 from pipeline.estimation.gates import min_gain, passes
 from pipeline.estimation.multi_position.selection import refusal
 from pipeline.physics.effects import catalogue, effect
+from pipeline.physics.signal.filters import MIN_SWING_DEGC, heats_and_cools
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.selection import Selection
     from pipeline.physics.effects.base import Effect
 
-LEAST_SPAN_DEGC = 1.0  # twice the step of a coarse thermometer, 0.5 degC
 OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "level": "nothing that shows the heading"}
 UNDESCRIBED = "the table's log describes no sample at which the rate changes"
 DRIFT = "bias_drift"
@@ -137,7 +137,8 @@ def _reason(this: Effect, selection: Selection) -> str:
         (this.needs_clock and not observations.clock_shared, "the time between the recordings is not known"),
         (bool(lacking), f"the recordings hold {' and '.join(lacking)}"),
         (not excited and this.needs_motion and not _moving(observations), "the table never moved while it was sampled"),
-        (warm and (not excited or span < LEAST_SPAN_DEGC), _steady(span)),
+        (this.needs_swing and span >= MIN_SWING_DEGC and not heats_and_cools(warmth), NO_SWING),
+        (warm and (not excited or span < MIN_SWING_DEGC), _steady(span)),
         (not excited and this.needs_both_directions and one_way(observations), in_one),
         (not excited and this.moves, UNDESCRIBED),
         (not excited, "bias and matrix explain all that it would add in this motion"),
@@ -183,7 +184,7 @@ def _reason_by_hand(this: Effect, selection: by_hand.SelectionByHand) -> str:
     if refused:
         return refused
     span = float(np.ptp(model.temperature))
-    if "temperature" in this.needs and span < LEAST_SPAN_DEGC:
+    if "temperature" in this.needs and span < MIN_SWING_DEGC:
         return f"{_steady(span)}; it needs {this.excitation}"
     score = selection.first.scores.get(this.name)
     if score is None and model.kinds == 1 and this.needs_motion:

@@ -31,11 +31,8 @@ UNKNOWN = {
     "angle": "turn again with the unit remounted at another angle: errors of the table stay at the same table angles",
     "specific_force": "record rests in which all three axes are inclined, and more than 1 g if you can",
 }
-LAG, HYSTERESIS = "temperature_lag", "temperature_hysteresis"  # covariates: of a soak that heats and cools
-IN_WORDS = {
-    LAG: "the rate of the temperature (a thermometer that lags behind the sensor, or before it)",
-    HYSTERESIS: "heating or cooling (hysteresis)",
-}
+HYSTERESIS = "temperature_hysteresis"  # a covariate, of a soak that heats and cools
+IN_WORDS = {HYSTERESIS: "heating or cooling (hysteresis)"}
 UNKNOWN |= dict.fromkeys(IN_WORDS, "heat and cool at half the rate: an error by lag halves, one by hysteresis stays")
 FAR_OFF = (
     "check the table against its log first (steps, backlash, rate, vibration) and the mounting: the residual is far "

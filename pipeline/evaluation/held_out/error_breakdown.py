@@ -178,7 +178,7 @@ def _lack(fitted: FittedEffect, samples: Samples) -> str | None:
         used = fields_used(samples.sensor, [fitted])
     except ConfigurationError as error:
         return f"the held-out recording logs no attitude ({error})"
-    if "temperature" in used and samples.temperature is None:
+    if "temperature" in found.needs and samples.temperature is None:
         return "the held-out recording holds no temperature"
     signal_of_other = "angular_rate" if samples.sensor == "accelerometer" else "specific_force"
     if signal_of_other in used and samples.other is None and not samples.resting:
@@ -256,7 +256,7 @@ def _by_calibrated_log(calibration: SensorCalibration, effects: Sequence[FittedE
     if samples.other is not None:
         readings[OTHER_SENSOR[sensor]] = samples.other
     used = fields_used(sensor, effects)
-    nothing = np.zeros_like(samples.reading)
+    nothing, warming = np.zeros_like(samples.reading), samples.temperature_rate
 
     def motion_of(truths: dict[str, Values], _number: int) -> Motion:
         found = log_motion(
@@ -264,6 +264,7 @@ def _by_calibrated_log(calibration: SensorCalibration, effects: Sequence[FittedE
             specific_force=truths.get("accelerometer", nothing),
             angular_rate=nothing if samples.resting else truths.get("gyroscope", nothing),
             temperature=samples.temperature,
+            temperature_rate=warming() if warming and "temperature_rate" in used else None,
             used=used,
             end=LogEnd(),
         )

@@ -25,7 +25,7 @@ with the eigenvalues l_i of S and the components t_i of t along its eigenvectors
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,11 +38,11 @@ from pipeline.physics.effects.equations import shifted
 from pipeline.physics.kinematics import earth_of, table_motion
 from pipeline.physics.measurement import linear_truth
 from pipeline.physics.signal.encoder_rate import MIN_RATE_SAMPLES, EncoderRate, rate_by_angle
-from pipeline.physics.signal.filters import filter_autocovariance
+from pipeline.physics.signal.filters import filter_autocovariance, temperature_rate_of
 from pipeline.physics.signal.quiet_motion import creep_of_rest, posterior_creep_rates
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.core.records import Index, Mask, Motion, Noise, Recording, SensorCalibration, Values
     from pipeline.core.settings import Settings, Table
@@ -74,6 +74,7 @@ class Samples:
     correlated_samples: float = 1.0  # that count as one independent sample of the noise after the filter
     setup: str = ""  # session of the recording
     earth_left_out: bool = False  # whether Earth's rotation is configured, but is not in the magnitude
+    temperature_rate: Callable[[], Values] | None = None  # returns (n,), degC/s; where the temperature is known
 
     @property
     def variance(self) -> Values:
@@ -177,24 +178,24 @@ class HeldOutCase:
         if sensor == "gyroscope" and recording.accelerometer is not None:
             rate, unknown = _creep(recording, rests, other)
             reading, white = reading - rate, white + unknown
-        time, temperature = (
-            None if v is None else np.array([np.mean(v[r.start : r.stop]) for r in rests])
-            for v in (recording.time, recording.temperature)
-        )
-        assert time is not None  # noqa: S101
+
+        def mean(values: Values) -> Values:
+            return np.array([np.mean(values[r.start : r.stop]) for r in rests])
+
         gravity = self.settings.table.gravity_g
         return Samples(
             sensor,
-            time,
+            mean(recording.time),
             reading,
             np.full(len(rests), gravity if sensor == "accelerometer" else 0.0),
             white,
             averaged[:, None] * (_wander_gain(recording) * noise.wander**2),
             None,
             _truth_of_other(other, self.other) if len(other) else None,
-            temperature,
+            None if recording.temperature is None else mean(recording.temperature),
             resting=True,
             setup=recording.setup,
+            temperature_rate=lambda: mean(temperature_rate_of(recording)),
         )
 
 
@@ -247,6 +248,7 @@ def samples_of_motion(
         correlated_samples=float((2.0 * squares.sum() - squares[0]) / squares[0]),  # sum of r_l^2 / r_0^2 over lags l
         setup=recording.setup,
         earth_left_out=sensor == "gyroscope" and earth is not None and motion is None,
+        temperature_rate=partial(temperature_rate_of, recording),
     )
 
 

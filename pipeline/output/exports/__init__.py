@@ -45,7 +45,7 @@ from pipeline.output.exports.sensors import (
     noise_figures,
     plain,
 )
-from pipeline.physics.compensation import OF_THE_PAST, SMOOTHING_S, Steps, circular
+from pipeline.physics.compensation import OF_THE_PAST, RATE_SMOOTHING_S, SMOOTHING_S, Steps, circular
 from pipeline.physics.effects import effect_of
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.physics.formula import c_number
@@ -302,7 +302,7 @@ def plan_of(sensors: dict[str, ExportedSensor]) -> JSON:
         step = steps[sensor] = Steps.of(sensor, [e for e in sensor_effects(calibration) if not reasons[e.name]])
         for effects, lines in ((step.steady, plan.steady), (step.moving, plan.moving)):
             for fitted in effects:
-                needs_time = bool(step.fields[fitted.name] & ({"time"} | OF_THE_PAST))
+                needs_time = bool(step.fields[fitted.name] & ({"time", "temperature_rate"} | OF_THE_PAST))
                 condition = "if (!m->alone) " if needs_time else ""
                 with_time |= {fitted.name} if needs_time else set()
                 terms = effect_of(fitted).in_c(fitted.values) or ()
@@ -313,7 +313,9 @@ def plan_of(sensors: dict[str, ExportedSensor]) -> JSON:
         "sensors": plans,
         "circular_sensors": circular_sensors,
         "past": past,
-        "temperature": "temperature" in used,
+        "temperature": bool(used & {"temperature", "temperature_rate"}),
+        "temperature_rate": "temperature_rate" in used,
+        "rate_memory": max(SMOOTHING_S, RATE_SMOOTHING_S),
         "with_time": sorted(with_time),
         "rounds": FIXED_POINT_ITERATIONS if circular_sensors else 1,
         "ends": FIXED_POINT_ITERATIONS if circular_sensors and past else 1,

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 REFERENCE_TEMPERATURE = 25.0  # degC, that of data sheets
 STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3
 OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic", "bias_temperature_cubic")  # effects
-OF_THE_ROOM = {"time", "temperature"}  # fields of a motion that do not depend on the readings
+OF_THE_ROOM = {"time", "temperature", "temperature_rate"}  # fields of a motion that do not depend on the readings
 MIN_PROGRAM_STEP_DEG = 5e-3  # above an encoder's resolution (1e-3 deg), below a step of a program (0.1 deg)
 MIN_TURNING_DPS = 0.25  # above a gyroscope's noise and residual bias, below a slow turn of a table (1 deg/s)
 
@@ -78,11 +78,13 @@ class Effect(abc.ABC):
     needs_clock: bool = False  # the time between the recordings must be known
     needs_motion: bool = False  # it adds nothing while the body rests
     needs_both_directions: bool = False  # turns in one direction show it as a part of bias and matrix
+    needs_swing: bool = False  # without a temperature that rises and falls it looks like a drift
     of_samples: bool = False  # its regressors at a sample depend on the motion at that sample alone
     of_turns: bool = False  # it has separate parameters for each recording of a turn
     nonlinear: tuple[str, ...] = ()  # parameters in which the reading is not linear
     prior: str = ""  # setting of the table that adds it to the model: standard deviation of its parameters
     contains: tuple[str, ...] = ()  # effects of which this is a generalisation; the two are never fitted together
+    scales_with: str = ""  # effect whose coefficient, times a time, is its own
     shown_by: str = ""  # kind of a sheet's recording, without which it is no candidate
     unseen: Mapping[str, str] = MappingProxyType({})  # sensor to the reason why the effect never changes its readings
     meaning: str  # one sentence for the reader of a report
@@ -194,7 +196,8 @@ def _watched(seen: set[str]) -> Motion:
 
     time, vector = np.arange(2.0), np.ones((2, 3))
     at_rest = (vector, vector, vector, vector, np.full(2, 25.0), time, time, 0, np.ones(2, bool))
-    return Watched(time, *at_rest, direction=vector, level=np.tile(np.eye(3), (2, 1, 1)))
+    level = np.tile(np.eye(3), (2, 1, 1))
+    return Watched(time, *at_rest, direction=vector, level=level, temperature_rate=time)
 
 
 def truth(sensor: str, motion: Motion) -> Values:

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 AS_DECLARED = (
     *("name", "owner", "sensors", "contains", "prior", "needs_both_directions", "meaning", "excitation", "experiment"),
-    *("experiment_by_hand", "source", "typical_share", "proposed", "shown_by"),
+    *("experiment_by_hand", "source", "typical_share", "proposed", "shown_by", "scales_with"),
 )
 OF_THE_TURN = ("angle", "rate")
 OPTIONAL_FIELDS = ("temperature", "angle", "rate", "level")  # fields that a motion may lack
@@ -105,7 +105,8 @@ class FormulaEffect(DeclaredEffect):
         self._by_axis, self._shared = [t for t in terms if not t.shared], [t for t in terms if t.shared]
         self._names = sorted({signal for term in terms for signal in term.signals})
         fields = {SIGNALS[name].field for name in self._names}
-        self.needs = tuple(field for field in OPTIONAL_FIELDS if field in fields)
+        self.needs_swing = "temperature_rate" in fields
+        self.needs = tuple(f for f in OPTIONAL_FIELDS if f in fields or (f == "temperature" and self.needs_swing))
         self.needs_clock = "time" in self._names
         self.needs_motion = all(t.signals & OF_THE_MOTION for t in terms)
         if self._shared or declared.axes != AXES:
@@ -277,6 +278,7 @@ class Declaration:
     typical_share: float = 0.5
     proposed: bool = False
     shown_by: str = ""
+    scales_with: str = ""
     built_in: bool = False
     python: str = ""
     parameters: dict[str, Term] = field(default_factory=dict)
@@ -410,6 +412,7 @@ BUILT_IN_CHECKS: dict[str, Check] = {
     "proposed": flag,
     "prior": TEXT,
     "shown_by": TEXT,
+    "scales_with": TEXT,
     "python": TEXT,
     "parameters": each(lambda given: Term(**fields(TERM_CHECKS, ("unit",))(given))),
 }

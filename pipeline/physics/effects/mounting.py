@@ -54,6 +54,7 @@ SEPARATOR = "@"
 EXPERIMENT = "the same turns in another setup"
 AS_THE_BASE = (
     *("owner", "layout", "sensors", "unseen", "needs", "needs_clock", "needs_motion", "needs_both_directions"),
+    "needs_swing",
     *("meaning", "excitation", "experiment", "source"),
 )
 

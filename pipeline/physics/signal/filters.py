@@ -52,7 +52,7 @@ from pipeline.core.records import Integers, Note, Recording, Values, noise_of_st
 from pipeline.core.settings import Filter
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
 
 MAX_GAP_MEDIANS = 1.5  # medians of the interval: a lost sample makes two of one
@@ -68,6 +68,7 @@ BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
 KERNEL_BLOCK = 256  # cells at once: their kernels stay in the processor's cache
 NARROWEST_S = 0.5  # below the thermal time constant of a package, which is seconds
 RELATIVE_ROUNDING = 1e-12  # relative: some thousand roundings of a double
+MIN_SWING_DEGC = 1.0  # twice the step of a coarse thermometer, 0.5 degC
 DISTINCT, AT_ENDS = 6.0, 5.0  # standard deviations; by how much the variance is larger at the ends of a file
 
 
@@ -312,6 +313,27 @@ def temperature_of(recording: Recording) -> Values:
     logged = recording.temperature
     assert logged is not None  # noqa: S101
     return smooth_temperature(recording.time, logged)
+
+
+@once_of_log
+def temperature_rate_of(recording: Recording) -> Values:
+    """Return the derivative of the smoothed temperature of a recording that logs it: (n,) array, degC/s."""
+    return rate_of_change(recording.time, temperature_of(recording))
+
+
+def rate_of_change(time: Values, values: Values) -> Values:
+    """Return the derivative of values at increasing times: (n,) array; 0 of a single value."""
+    return np.gradient(values, time) if len(time) > 1 else np.zeros(len(time))
+
+
+def heats_and_cools(temperatures: Iterable[Values | None]) -> bool:
+    """Return whether the temperature rises and falls by ``MIN_SWING_DEGC`` within recordings, each smoothed, degC."""
+    rises = falls = False
+    for warmth in temperatures:
+        if warmth is not None and len(warmth) and np.ptp(warmth) >= MIN_SWING_DEGC:
+            rises |= bool(np.max(warmth - np.minimum.accumulate(warmth)) >= MIN_SWING_DEGC)
+            falls |= bool(np.max(np.maximum.accumulate(warmth) - warmth) >= MIN_SWING_DEGC)
+    return rises and falls
 
 
 def _local_line(time: Values, temperature: Values, bandwidth: float) -> Values:

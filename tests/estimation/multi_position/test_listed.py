@@ -292,28 +292,34 @@ def test_a_soak_shows_bias_over_temperature_to_the_third_power(tmp_path: Path) -
     assert result.calibration["calibrated_range"]["temperature_degc"] == pytest.approx([-15.0, 65.0], abs=0.5)
 
 
-# A die that follows the thermometer with a time constant, s; a bias that differs between heating and cooling, deg/s.
+# A thermometer that follows the die with a time constant, s; a bias that differs between heating and cooling, deg/s.
 @pytest.mark.parametrize(
-    ("lag", "loop", "named"),
-    [(0.0, 0.0, []), (60.0, 0.0, ["temperature_lag"]), (0.0, 0.05, ["temperature_hysteresis"])],
+    ("lag", "loop", "named"), [(0.0, 0.0, []), (30.0, 0.0, []), (0.0, 0.05, ["temperature_hysteresis"])]
 )
 def test_a_soak_that_heats_and_cools_shows_lag_and_hysteresis(
     tmp_path: Path, lag: float, loop: float, named: list[str]
 ) -> None:
-    rng, n = np.random.default_rng(14), 5400
+    rng, n, b_T = np.random.default_rng(14), 5400, np.array([0.01, -0.02, 0.03])
     time, keep = np.arange(n) / 1.0, np.exp(-1.0 / lag) if lag else 0.0
-    warm = 30.0 * np.sin(2.0 * np.pi * time / n)
-    die = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], warm)
+    die = 30.0 * np.sin(np.pi * time / n) ** 2
+    warm = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], die)  # the thermometer
     heats = np.tanh(np.gradient(die) / 0.005)
-    gyro = np.outer(die, [0.01, -0.02, 0.03]) + loop * np.outer(heats, [1.0, -1.0, 1.0]) + [0.5, -1.0, 2.0]
+    gyro = np.outer(die, b_T) + loop * np.outer(heats, [1.0, -1.0, 1.0]) + [0.5, -1.0, 2.0]
     table_ = np.column_stack([time, gyro + 5e-3 * np.sqrt(0.5) * rng.normal(size=(n, 3)), 25.0 + warm])
     header = "time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,temperature_degc"
     np.savetxt(tmp_path / "soak.csv", table_, fmt="%.8g", delimiter=",", header=header, comments="")
     (tmp_path / "recordings.csv").write_text("file,kind\nsoak.csv,soak\n")
-    diagnosis = calibrated(tmp_path, "effects.gyroscope=auto").diagnosis["gyroscope"]
+    found = calibrated(tmp_path, "effects.gyroscope=auto")
+    diagnosis, effects = found.diagnosis["gyroscope"], found.calibration["gyroscope"]["effects"]
     assert [each["covariate"] for each in diagnosis["unexplained"]] == named
-    words = {"temperature_lag": "a thermometer that lags", "temperature_hysteresis": "heating or cooling (hysteresis)"}
-    assert all(words[name] in diagnosis["reason"] for name in named)
+    assert ("heating or cooling (hysteresis)" in diagnosis["reason"]) is bool(loop)
+    assert ("temperature_lag" in [e["name"] for e in effects]) is bool(lag)
+    if not loop:
+        assert [e["name"] for e in effects] == ["bias_temperature", "temperature_lag"][: 1 + bool(lag)]
+    if lag:
+        b_tau = keep / (1.0 - keep) * b_T  # by the mean delay of the filter in s, which is near the lag
+        pairs = zip(effects[1]["parameters"].values(), b_tau, strict=True)
+        assert all(abs(p["value"] - b) < 1.5 * p["expanded_uncertainty"] for p, b in pairs)
 
 
 def test_rows_beyond_the_soaked_temperatures_are_marked_or_refused(tmp_path: Path) -> None:
