@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 WITH_THEM = " (with which U of the "  # between open effects and the uncertainty, in summary.csv and sentences
 MARK_ABOVE_FLOORS = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good
+# the same of the angle after held-out moves by hand, over that by noise alone: those of a published Xsens miss by 5.9
+# with its g-sensitivity left out, else by 1.7
+MARK_AFTER_MOVES = 5.0
 FAILED, INCOMPLETE, IMPLAUSIBLE, NOT_HELD_OUT = "failed", "incomplete", "implausible", "not_held_out"
 FAR, BEYOND_ACCEPTANCE, READY = "far_above_noise", "beyond_acceptance", "ready"
 SETTING = re.compile(r"\(([a-z_.]+=\w+)\)")  # a setting within a next step
@@ -214,11 +217,24 @@ def _kinds(row: Mapping[str, Any], errors: Mapping[str, Error]) -> dict[str, lis
             verdict = Verdict.NOTHING_MISSING  # it is not known, and the kind is INCOMPLETE
         quiet = verdict in (Verdict.NOTHING_MISSING, Verdict.NOT_ENOUGH_DATA)
         kinds = [] if verdict == Verdict.NOTHING_MISSING else [str(verdict)]
-        kinds += [FAR] * bool(quiet and ratio and ratio > MARK_ABOVE_FLOORS)
+        kinds += [FAR] * bool(quiet and ((ratio or 0.0) > MARK_ABOVE_FLOORS or _far_after_moves(row, sensor)))
         kinds += [kind for kind in (IMPLAUSIBLE, NOT_HELD_OUT) if row.get(f"{sensor}_{kind}")]
         for kind in kinds:
             found.setdefault(kind, []).append(sensor)
     return {kind: found[kind] for kind in KINDS if kind in found} if len(found) > 1 else found
+
+
+def moves_over_noise(validation: Mapping[str, Any]) -> float | None:
+    """Return the mean angle after held-out moves by hand over that by noise alone; None without them."""
+    found = validation.get("gravity_direction") or {}
+    floor = found.get("noise_floor_deg")
+    return found["mean_deg"]["after"] / floor if floor else None
+
+
+def _far_after_moves(row: Mapping[str, Any], sensor: str) -> str:
+    """Return the angle after held-out moves by hand in words if a unit is marked for it; else an empty text."""
+    over = _number(row.get(f"{sensor}_moves_over_noise")) or 0.0
+    return decided_words("angle", over) if over > MARK_AFTER_MOVES else ""
 
 
 def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False) -> list[Problem]:
@@ -235,6 +251,8 @@ def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False
                 effects = tuple(f"{s}.{name}" for s, chosen in names for name in chosen if name)
             ratio, worst = max(((errors[s].ratio or 0.0, s) for s in sensors), default=(0.0, ""))
             step, decided = (row.get(f"{worst}_{column}") or "" for column in ("next_step", "decided_by"))
+            if kind == FAR:
+                decided = next(filter(None, (_far_after_moves(row, s) for s in sensors)), "")
             groups.setdefault((kind, effects), []).append((ratio, str(row["unit"]), step, sensors, decided))
     order, found = [*KINDS], []
     for (kind, effects), entries in sorted(groups.items(), key=lambda group: order.index(group[0][0])):
@@ -247,7 +265,7 @@ def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False
             others = len({entry[2] for entry in entries}) > 1
             step = entries[0][2] + f" ({entries[0][1]}; the pages of the others state theirs)" * others
         units, span = [unit for _, unit, *_ in entries], (known[-1], known[0]) if known else None
-        decided = _decided([entry[4] for entry in entries]) if kind in DOUBTS else ""
+        decided = _decided([entry[4] for entry in entries]) if kind in {*DOUBTS, FAR} else ""
         found.append(Problem(kind, what, units, span, step, effects, decided))
     return found
 

@@ -84,9 +84,15 @@ def harmful_in_turns(selection: Selection, fits: Sequence[JointFit]) -> dict[str
 
     Each fit is repeated without a fifth of every recording by one step from its values.
     """
-    names, observations = selection.names, selection.observations
-    if not names:
+    fit = selection.fit
+    if not selection.names:
         return {}
+    key = harmful_in_turns, *selection.names, fit.bias.tobytes(), fit.K.tobytes()
+    return selection.observations.once(key, lambda: _harmful_in_turns(selection, fits))
+
+
+def _harmful_in_turns(selection: Selection, fits: Sequence[JointFit]) -> dict[str, str]:
+    names, observations = selection.names, selection.observations
     stretches = [np.arange(len(part.weight)) * LEFT_OUT_STRETCHES // len(part.weight) for part in observations.parts]
     weight, of_fold = observations.weight, np.concatenate(stretches) % TURN_FOLDS
     label = np.concatenate([k * LEFT_OUT_STRETCHES + each for k, each in enumerate(stretches)])

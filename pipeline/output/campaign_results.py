@@ -47,7 +47,13 @@ CHIPS = ["board", "reference", "unit", "parameter", "value", "value_unit", "expa
 NOISE_COLUMNS = (
     "axis", "term", "value", "value_unit", "low", "high", "upper_limit", "correlation_time_s", "frequency_hz", "reason",
 )  # fmt: skip
-FIGURE_ENDINGS = ("_before", "_after", "_floor", "_answers")  # endings of the columns of summary.csv that hold numbers
+FIGURE_ENDINGS = (
+    "_before",
+    "_after",
+    "_floor",
+    "_answers",
+    "_over_noise",
+)  # endings of the columns of summary.csv that hold numbers
 
 
 @dataclass(frozen=True)
@@ -99,8 +105,9 @@ class CampaignResults:
         (g or deg/s), ``_verdict``, ``_selected`` (missing effects, joined by ";"), ``_reason``, ``_answers`` (number of
         answers in the answer set), ``_beyond_limits`` (parameters beyond the sensor file's limits), ``_implausible``,
         ``_not_in_uncertainty``, ``_not_held_out`` (why nothing was held out), ``_decided_by`` (the figure that
-        decided the verdict); ``pass``; ``left_out`` (rows that no fit uses); ``incomplete`` (stages after the fit that
-        failed, and why); and other columns of ``units.csv``.
+        decided the verdict); ``gyroscope_moves_over_noise`` (angle after held-out moves by hand); ``pass``;
+        ``left_out`` (rows that no fit uses); ``incomplete`` (stages after the fit that failed, and why); and other
+        columns of ``units.csv``.
         """
         kinds = {name: "float" if name.endswith(FIGURE_ENDINGS) else "str" for name in SUMMARY_COLUMNS} | {
             "pass": "boolean"

@@ -336,7 +336,7 @@ def apply_command(settings: Mapping[str, Any], unit: str) -> str:
     """Return the command that compensates a log with the calibration of a unit, for the default folder of results."""
     campaign = str(settings.get("campaign", "demo")).rstrip("/").rpartition("/")[2]
     file = f"{DEFAULT_RESULTS}/{campaign}/calibrations/{unit}.json"
-    return shlex.join([*_program(), "apply", "--calibration", file, "LOG.csv", "-o", "COMPENSATED.csv"])
+    return shlex.join([*_program(), "apply", "--calibration", file, "LOG.csv", "-o", "LOG_calibrated.csv"])
 
 
 def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], results: str = DEFAULT_RESULTS) -> str:

@@ -93,7 +93,7 @@ def test_the_readme_says_how_to_mount_and_record_and_what_stays_unseen(tmp_path:
                 "No missing effect would show",
             ],
         ),
-        (["--procedure", "listed"], ["| `label` | any text |", "judge.csv,turn,z,360,1,yes", "check --campaign ."]),
+        (["--procedure", "listed"], ["| `label` | any text |", "judge.csv,turn,z,360,,yes", "check --campaign ."]),
         (["--procedure", "six_positions"], ["nothing is held out"]),
         (["--table", "single_axis"], ["Mount the unit anew for each turn axis, to 2 deg", "askew on the turn axis"]),
         (["--table", "mark2"], ["does not log its motion"]),

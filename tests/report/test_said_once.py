@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from unit_settings import settings_of
 
 from pipeline.app.commands.explain import explain
 from pipeline.core.files import write_json
@@ -107,6 +108,29 @@ def test_the_figure_that_decided_a_verdict_is_the_one_that_is_said(known: Unit, 
     assert "scatter of the moves, 7.21 x noise" in said_there
     (problem, *_) = problems([row | {"gyroscope_decided_by": decided_words("held_out")}])
     assert re.search(r"; held-out error \S+ x noise$", problem_words(problem))
+
+
+def test_by_hand_the_angle_after_moves_is_said_first_with_how_many_judge_it(known: Unit, tmp_path: Path) -> None:
+    validation, settings = copy.deepcopy(known.validation), settings_of(known.settings, table="hand")
+    angles = {"mean_deg": {"before": 1.31, "after": 0.813}, "rms_deg": {"before": 1.6, "after": 0.955}}
+    moves = {"reason": None, "moves": 2, **angles, "max_deg": {"before": 2.2, "after": 1.3}, "noise_floor_deg": 0.063}
+    validation["gravity_direction"] = {**moves, "creeping_rests": 0, "largest_expected_rms_deg": 3.9}
+    validation["gyroscope"] |= {"samples": 1, "held_out": True}
+    found = copy.deepcopy(known.diagnosis)
+    found["gyroscope"] |= {"verdict": "nothing_missing", "selected": [], "unexplained": [], "reason": ""}
+    words = {s: in_words(found[s], s) for s in SENSORS}
+    page = render(known.calibration, validation, found, [], settings, words=words)
+    card = Text(page[page.index("<h2>Gyroscope</h2>") :]).text
+    assert card.index("0.813 deg error after a held-out move, 12.9 × noise") < card.index("At rest")
+    assert "Judged by 1 held-out rest and 2 held-out moves." in card
+    assert "does not show that the calibration is good" in card
+    row = summary_row("U1", known.calibration, validation, found, {})
+    (far,) = [p for p in problems([row]) if p.kind == "far_above_noise" and "gyroscope" in p.what]
+    assert problem_words(far).endswith("angle after held-out moves, 12.9 x noise")
+    write_json(tmp_path / "validations" / "U1.json", validation)
+    told = explain(tmp_path, {"U1": found | {"unit": "U1"}}, {})
+    assert "Judged by 1 held-out rest." in told
+    assert "The mean angle is 12.9 times that by noise alone" in told
 
 
 def test_the_terminal_names_a_unit_once_and_an_action(known: Unit) -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,8 +21,15 @@ from pipeline.core.records import SENSORS, Recording
 from pipeline.ingest.read import read_recordings
 from pipeline.physics.kinematics import reference_motion
 from pipeline.simulation.campaign import simulate_unit, write_campaign
-from pipeline.simulation.description import UnitDescription, description_from, read_description, shipped_settings
+from pipeline.simulation.description import (
+    Course,
+    UnitDescription,
+    description_from,
+    read_description,
+    shipped_settings,
+)
 
+RECORD = Path(__file__).parents[2] / "docs" / "record.md"
 DEMO = Path(__file__).parents[2] / "data" / "demo"
 SHORT = {"step_deg": 30.0, "validation_s": 30.0, "static_s": 20.0}
 
@@ -339,3 +347,13 @@ def test_the_demo_s_home_made_table_is_off_and_its_held_out_motion_is_not() -> N
     assert np.mean(left) == pytest.approx(-0.027 * 60.0, abs=0.15)
     precise = json.loads((DEMO / "truth" / "mpu6050-1.json").read_text())
     assert np.std(residual(recordings["validation"], precise, "gyroscope")) < 0.013
+
+
+def test_a_turn_by_hand_has_one_accuracy() -> None:
+    course, said = Course(), re.search(r"a multiple of it; its uncertainty \| 360, (\S+) \|", RECORD.read_text())
+    assert said
+    for procedure in ("ferraris", "listed"):
+        turns = shipped_settings(procedure=procedure).procedure.turns
+        assert turns is not None
+        assert turns.accuracy_deg == course.turn_error_deg == float(said[1])
+        assert turns.axis_accuracy_deg == course.turn_axis_error_deg

@@ -16,8 +16,17 @@ from pipeline.core.errors import InputError, MissingInputError
 from pipeline.core.files import JSON, read_json
 from pipeline.core.pack import batches_of, is_published, read_published
 from pipeline.core.records import SENSORS
-from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, error_of, problems
+from pipeline.core.verdicts import (
+    KINDS,
+    MARK_ABOVE_FLOORS,
+    MARK_AFTER_MOVES,
+    Verdict,
+    error_of,
+    moves_over_noise,
+    problems,
+)
 from pipeline.evaluation.diagnosis.words import in_words
+from pipeline.evaluation.held_out.attitude import NO_HAND
 from pipeline.output.exports.reading import counts_of, explain_board, explain_calibration, read_any
 from pipeline.output.history import read_history
 from pipeline.output.outcome import (
@@ -245,9 +254,12 @@ def explain(
                 *(f"Left out: {line}." for line in left_out(calibration.get("inputs"))),
             ],
             "board": explain_board(calibration),
+            "moves": moves_over_noise(validation),
+            "by_hand": (validation.get("gravity_direction") or {}).get("reason", NO_HAND) != NO_HAND,
         })  # fmt: skip
     text: str = template("explain.txt").render(
         far=MARK_ABOVE_FLOORS,
+        far_after_moves=MARK_AFTER_MOVES,
         units=[*units, *({"name": unit, "failure": failure} for unit, failure in failures.items())],
     )
     return "\n".join([*_wrapped(text.splitlines(), width), ""])

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from pipeline.core.verdicts import Verdict, decided_words
+from pipeline.core.verdicts import MARK_AFTER_MOVES, Verdict, decided_words
 from pipeline.estimation.stages import FitStage
 from pipeline.evaluation.diagnosis.words import listed, of_unknown, plain, template
 from pipeline.physics.effects.base import unit_of
@@ -39,8 +39,6 @@ FAR_ABOVE_BY_HAND = 10.0  # times the noise: nobody sets down or holds a unit so
 # times the noise: a good hand scatters the directions of the published wearable by 5.1, scale factors that drift by
 # 1 to 3 % in a recording by 6.8 to 21
 MAX_SCATTER_BY_HAND = 6.0
-# times the noise: held-out moves of a published Xsens miss by 5.9 with its g-sensitivity left out, else by 1.7
-MAX_OVER_NOISE = 5.0
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
 STATIC_AGAIN = "record static again: ten minutes or more at rest, on a base that does not shake"
 SAME_SESSION = "record static in the session of the other recordings, without switching the unit off in between"
@@ -56,7 +54,7 @@ RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
     (Verdict.REFERENCE_IN_DOUBT, "contradiction", lambda e: e.above),
     (Verdict.UNEXPLAINED, "unexplained", lambda e: e.unexplained),
     (Verdict.UNEXPLAINED, "moves", lambda e: e.moves and e.moves.over_largest > 1.0 and not e.missing),
-    (Verdict.UNEXPLAINED, "far_moves", lambda e: e.moves and e.moves.over_noise > MAX_OVER_NOISE and not e.missing),
+    (Verdict.UNEXPLAINED, "far_moves", lambda e: e.moves and e.moves.over_noise > MARK_AFTER_MOVES and not e.missing),
     (Verdict.UNEXPLAINED, "scatter", lambda e: e.scatter > MAX_SCATTER_BY_HAND and not e.missing),
     (Verdict.MISSING_EFFECT, "missing", lambda e: e.missing),
     (Verdict.REFERENCE_IN_DOUBT, "disagreement", lambda e: e.disagrees),

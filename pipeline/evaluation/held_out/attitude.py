@@ -61,6 +61,7 @@ CURVE_POINTS = 120  # points of the published curves
 MAX_FILTER_STEP_S, MAX_FILTER_STEP_DEG = 0.1, 5.0
 STEADY_HAND = 3.0  # times the noise: largest scatter of moves that explains errors; 289 good hands fitted none
 FILTER_GAIN = 0.5  # of the complementary filter: its library's default
+NO_HAND = "not recorded by hand"
 TILT_SETTLING_S = 10.0  # s after which the tilt counts
 
 
@@ -229,7 +230,7 @@ def gravity_direction(
     stated_deg`` and ``angle_deg`` (``before`` and ``after``).
     """
     if not is_multi_position("gyroscope", recordings):
-        return {"reason": "not recorded by hand"}
+        return {"reason": NO_HAND}
     if accelerometer is None or gyroscope is None:
         return {"reason": "both sensors have to be calibrated"}
     role = HELD_OUT if any(r.role == HELD_OUT for r in recordings) else ROLE

@@ -31,7 +31,7 @@ from pipeline.core.records import (
     SENSORS,
     standard_uncertainty,
 )
-from pipeline.core.verdicts import Verdict, error_of
+from pipeline.core.verdicts import Verdict, error_of, moves_over_noise
 from pipeline.estimation.candidates import is_fixed
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.pages.held_out_section import first_and_last_step, passes
@@ -58,8 +58,10 @@ NEXT = tuple(
     for s in SENSORS
     for c in ("vector_error_before", "vector_error_after", "vector_noise_floor", "next_step", "decided_by")
 )
+MOVES = "gyroscope_moves_over_noise"
 SUMMARY_COLUMNS = (
-    *UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, *OF_UNIT, *NEXT
+    *UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, *OF_UNIT, *NEXT,
+    MOVES,
 )  # fmt: skip
 PARAMETER_KEYS = ("sensor", "parameter", "label", "measure", "value", "u", "U", "limit", "beyond", "fitted")
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
@@ -202,6 +204,7 @@ def summary_row(
         "method": calibration.get("method"),
         "pass": passes(calibration, validation),
         "left_out": "; ".join(left_out(calibration.get("inputs"))) or None,
+        MOVES: moves_over_noise(validation or {}),
     }
     for sensor in SENSORS:
         held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}

@@ -11,7 +11,16 @@ import numpy as np
 
 from pipeline.core.files import JSON, json_text
 from pipeline.core.records import AXES, BIAS, MATRIX, SENSOR_UNITS, SENSORS, Recording, Values
-from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, css_class, error_of, kinds_of
+from pipeline.core.verdicts import (
+    KINDS,
+    MARK_ABOVE_FLOORS,
+    MARK_AFTER_MOVES,
+    Verdict,
+    css_class,
+    error_of,
+    kinds_of,
+    moves_over_noise,
+)
 from pipeline.output.outcome import apply_command, as_overrides, commands_of, found_mountings, place, run_command
 from pipeline.output.pages.chart import ChartLayer, Figure, LineMark, Panel, chart
 from pipeline.output.pages.held_out_section import (
@@ -90,8 +99,8 @@ def render(
         if shown["part"] is None:
             shown["reason"] = calibration.get("not_calibrated", {}).get(sensor, "the procedure does not calibrate it")
         else:
-            held_out, found = validation.get(sensor) or {}, diagnosis.get(sensor) or {}
-            shown |= _sensor(sensor, calibration, held_out, found, recordings=recordings, settings=settings)
+            found = diagnosis.get(sensor) or {}
+            shown |= _sensor(sensor, calibration, validation, found, recordings=recordings, settings=settings)
             shown |= _sentences(words.get(sensor) or [], found)
         sensors.append(shown)
     page: str = template("unit.html").render(
@@ -134,10 +143,10 @@ def found_mounting(calibration: JSON) -> JSON | None:
 
 
 def _sensor(
-    sensor: str, calibration: JSON, held_out: JSON, found: JSON, *, recordings: list[Recording], settings: Settings
+    sensor: str, calibration: JSON, validation: JSON, found: JSON, *, recordings: list[Recording], settings: Settings
 ) -> JSON:
-    """Return what the template shows of a calibrated sensor, from its parts of validation and diagnosis."""
-    part, table = calibration[sensor], settings.table
+    """Return what the template shows of a calibrated sensor; ``found``: its part of the diagnosis."""
+    part, held_out, table = calibration[sensor], validation.get(sensor) or {}, settings.table
     data_sheet = settings.sensor.of(sensor)
     noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
     error = error_of(held_out)
@@ -147,7 +156,8 @@ def _sensor(
     kind = "warn" if found.get("failed") else kind
     likely = (found.get("answer_set") or [{}])[0].get("effects")
     logged = any(v is not None for r in recordings for v in (r.table_attitude, r.table_rate, r.table_angle))
-    far = (error.ratio or 0.0) > MARK_ABOVE_FLOORS
+    moves = moves_over_noise(validation) if sensor == "gyroscope" else None
+    far = (error.ratio or 0.0) > MARK_ABOVE_FLOORS or (moves or 0.0) > MARK_AFTER_MOVES
     steps = {kind: error_steps(sensor, held_out, found, scale, vector=kind == "vector") for kind in KINDS_OF_ERROR}
     evidence = [added_variable(sensor, found), *unexplained(sensor, found)]
     dependence = residual_figures(sensor, traces, noise)
@@ -182,6 +192,7 @@ def _sensor(
         "frame": frame_words(part),
         "kind": "warn" if not held_out.get("held_out", True) else "" if (far or likely) and kind == "good" else kind,
         "of_rests": table.motion == "none" and not logged,
+        "moves": {**validation["gravity_direction"], "over_noise": moves} if moves else None,
         "far": far,
         "commands": commands_of(found, sensor, str(calibration.get("unit")), run)
         if (run := settings.stated.run)
