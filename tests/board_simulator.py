@@ -18,7 +18,7 @@ from pipeline.core.records import Recording
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.chip_fit import Chip
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.estimation.stages import fit_stage
+from pipeline.estimation.stages import StageInput, fit_stage
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def hand_board(rng: np.random.Generator, chips: Sequence[TrueChip], path: Path, 
     for number, chip in enumerate(chips):
         readings = read(chip, felt(path, chip.place, shift=chip.delay), rng, float(np.diff(path.time).mean()), noise)
         recordings = [Recording("recording", "rests", None, np.round(path.time * 1e9).astype(np.int64), **readings)]
-        fits = {s: fit.fit(with_noise(recordings, settings), None, settings) for s, fit in HAND.items()}
+        fits = {s: fit.fit(StageInput(s, with_noise(recordings, settings), None, settings)) for s, fit in HAND.items()}
         found.append(Chip(f"chip{number}", recordings, fits, settings.sensor))
     return found
 

@@ -11,6 +11,7 @@ from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.estimation.stages import StageInput
 from pipeline.physics.signal.rests import find_rests
 from pipeline.physics.signal.segments import cut, held_out_windows
 from pipeline.simulation.campaign import simulate_unit
@@ -33,7 +34,7 @@ class Session:
     settings: Settings
 
     def fit(self, sensor: str) -> SensorCalibration:
-        return FITS[sensor].fit(with_noise(self.recordings, self.settings), None, self.settings)
+        return FITS[sensor].fit(StageInput(sensor, with_noise(self.recordings, self.settings), None, self.settings))
 
     def errors(self, sensor: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the error of bias and matrix, its standard uncertainty and degrees of freedom: (12,) arrays."""

@@ -12,6 +12,7 @@ from unit_settings import settings_of, with_noise
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.stages import StageInput
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 from tests.published import diagnose
@@ -41,7 +42,7 @@ class Unit:
     settings: Settings
 
     def calibrated(self, sensor: str) -> SensorCalibration:
-        return METHODS[sensor].fit(with_noise(self.recordings, self.settings), None, self.settings)
+        return METHODS[sensor].fit(StageInput(sensor, with_noise(self.recordings, self.settings), None, self.settings))
 
     def diagnosed(self, sensor: str, configured: Any = (), calibration: SensorCalibration | None = None) -> Any:
         names = configured if isinstance(configured, str) else list(configured)

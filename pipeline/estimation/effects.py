@@ -21,7 +21,7 @@ from pipeline.estimation.noise import with_noises
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import ROLE, is_multi_position
 from pipeline.estimation.selection import select
-from pipeline.estimation.stages import FitStage, given_calibration, is_given
+from pipeline.estimation.stages import FitStage, StageInput, given_calibration, is_given
 from pipeline.physics.effects import bench_priors, effect, stated_priors
 
 if TYPE_CHECKING:
@@ -37,19 +37,17 @@ ALL: tuple[Change, ...] = ("bias", "matrix", "effects")
 FIT_STAGES = {"effects": FitStage(changes=ALL, accepts=("readings", *ALL), free=True, reference=True)}
 
 
-def fit(
-    sensor: str, recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
-) -> SensorCalibration:
+def fit(task: StageInput) -> SensorCalibration:
     """Fit the effects of ``settings.effects`` together with bias and matrix, after every method.
 
     Returns ``previous`` unchanged if there are no effects to add.
     """
-    before = previous or SensorCalibration(sensor)
+    sensor, recordings, settings, noise = task.sensor, task.recordings, task.settings, task.noise
+    before = task.previous or SensorCalibration(sensor)
     by_hand = is_multi_position(sensor, recordings.filtered)
     of_bench = not by_hand and stated_priors(settings.table)
     if not settings.effects.of(sensor) and not of_bench:
         return before
-    noise = recordings.noises[sensor]
     if by_hand:
         return fit_effects_by_rests(before, recordings, settings)
     names = configured_effects(sensor, settings, recordings.filtered)
@@ -106,7 +104,7 @@ def accelerometer_of(recordings: UnitRecordings, settings: Settings) -> SensorCa
     try:
         if is_given("accelerometer", settings.method):
             return given_calibration("accelerometer", settings.method)
-        return nonlinear_least_squares.fit(recordings, None, settings)
+        return nonlinear_least_squares.fit(StageInput("accelerometer", recordings, None, settings))
     except (NotObservableError, CannotCalibrateError) as lack:
         raise CannotCalibrateError(
             f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"

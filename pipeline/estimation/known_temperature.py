@@ -19,14 +19,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.records import Coefficient, Estimate, FittedEffect, SensorCalibration, StageResult
-from pipeline.estimation.stages import FitStage, known_effects
+from pipeline.core.records import Coefficient, FittedEffect
+from pipeline.estimation.stages import FitStage
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 
 if TYPE_CHECKING:
-    from pipeline.core.records import UnitRecordings
-    from pipeline.core.settings import DataSheet, Settings
+    from pipeline.core.settings import DataSheet
 
 NAME = "known_temperature"
 
@@ -57,13 +56,3 @@ def known(sensor: str, data_sheet: DataSheet) -> list[FittedEffect]:
 
 
 FIT_STAGES = {NAME: FitStage(changes=("readings",), known=known)}
-
-
-def fit(
-    sensor: str, recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
-) -> SensorCalibration:
-    """Return the known effects as a calibration without bias and matrix (``pipeline.estimation.stages``)."""
-    del recordings, previous  # it is the first stage
-    effects = known_effects(sensor, settings.method)
-    parameters = {f"{e.name}.{name}": Estimate(p.value, p.unit) for e in effects for name, p in e.parameters.items()}
-    return SensorCalibration(sensor, effects=effects, stages=(StageResult(NAME, parameters),))

@@ -25,7 +25,6 @@ The covariance includes bias wander (``pipeline.estimation.engine``) and the tab
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,19 +34,13 @@ from pipeline.estimation.candidates import bench_effects
 from pipeline.estimation.engine import LinearMap, ScaledColumns, linear_convergence
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.monte_carlo import with_matrix
-from pipeline.estimation.noise import wander_prior
-from pipeline.estimation.stages import FitStage
+from pipeline.estimation.stages import FitStage, StageInput
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, settled, used_motions
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
 from pipeline.physics.effects import stated_priors
 from pipeline.physics.effects.base import truth
 from pipeline.physics.signal.filters import filtered
-
-if TYPE_CHECKING:
-    from pipeline.core.records import UnitRecordings
-    from pipeline.core.settings import Settings
-
 
 NAME = "reference_least_squares"
 FIT_STAGES = {NAME: FitStage(accepts=("readings",), changes=("bias", "matrix", "effects"), free=True, reference=True)}
@@ -60,10 +53,9 @@ ADVICE = {
 }
 
 
-def fit(
-    sensor: str, recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
-) -> SensorCalibration:
+def fit(task: StageInput) -> SensorCalibration:
     """Fit bias and matrix of a sensor against the table's motion (``pipeline.estimation.stages``); role: the sensor."""
+    sensor, recordings, settings, prior = task.sensor, task.recordings, task.settings, task.prior
     parts = [_select(sensor, part) for part in parts_of(recordings.filtered, sensor, settings.table, NAME)]
     y = np.concatenate([part.reading(sensor) for part in parts])
     u = np.concatenate([_reference(sensor, part)[part.keep] for part in parts])
@@ -72,7 +64,6 @@ def fit(
     factors = ScaledColumns.of(X)
     beta = factors.solve(y)
     residuals = y - X @ beta
-    prior = wander_prior(recordings.noises[sensor], settings.sensor.of(sensor))
     bias, K = beta[0], beta[1:].T
     matrix = np.asarray(np.linalg.solve(K, np.eye(3)), float)
     J = np.zeros((3, BASE_COUNT, 4))
@@ -102,7 +93,7 @@ def fit(
         sensor=sensor,
         bias=bias,
         matrix=matrix,
-        stages=(*(previous.stages if previous else ()), result),
+        stages=(*task.stages, result),
         convergence=linear_convergence(X, residuals, condition, rank),
     )
 

@@ -1,14 +1,10 @@
-"""Run the stages of a fit.
+"""Run the stages of a fit: the contract of a stage is ``FitStage``, ``StageInput`` and ``StageOutput``.
 
-A stage is a module ``pipeline/estimation/<sensor>/<stage>.py`` with ``fit(recordings, previous, settings)``, or, if it
-is the same for both sensors, ``pipeline/estimation/<stage>.py`` with ``fit(sensor, recordings, previous, settings)``.
-The stages of the staged method are functions of one module for each sensor, whose ``fit`` takes their name first. Each
-module declares its stages in ``FIT_STAGES``, by name (``FitStage``). A new stage needs only such a module and its name
-in a method's list.
-
-    recordings : all of a unit, with the noise of each sensor; a stage uses those of its roles
-    previous   : the result of the stage before, whose stages the new result continues; None for the first
-    settings   : sections of the configuration
+A stage is a module ``pipeline/estimation/<stage>.py``, or of one sensor ``pipeline/estimation/<sensor>/<stage>.py``,
+with its declaration in ``FIT_STAGES``, by name (``FitStage``), and ``fit(task: StageInput)``. It returns a
+``StageOutput``; a fit to a table's motion or to moves, which has a budget of its own, returns the
+``SensorCalibration``. The stages of the staged method are functions of one module for each sensor. A stage of known
+effects has no ``fit`` (``FitStage.known``).
 
 A stage raises ``CannotCalibrateError`` if there is no recording for it, ``NotObservableError`` if the recordings do not
 determine its parameters. ``check_stages`` refuses a method whose stages cannot follow each other before any job.
@@ -16,23 +12,12 @@ determine its parameters. ``check_stages`` refuses a method whose stages cannot 
 The stage ``given`` (``method=given``) is no fit: it takes bias, matrix and effects from an existing calibration file,
 for validation and diagnosis with the recordings. The uncertainty is that of the file. If the file states none, the
 covariance is zero, which the budget states; any held-out error beyond noise is then an error of the calibration.
-
-``pipeline.core.records.calibration`` describes the correction of readings by the stages so far.
-
-Subtract effects with known parameters from readings, and keep them in the calibration that is fitted to the others.
-
-    reading - z(motion, K; p) = bias + K @ truth + noise
-
-with the effects z and known parameters p that a stage of the method states (``FitStage.known``). ``truth`` is that of
-the readings themselves by bias and matrix so far (``pipeline.physics.measurement``), so that no table is needed. An
-effect of the same name that is fitted to the corrected readings is what the known parameters leave: the calibration has
-the sum.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import dataclass, field, replace
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -42,150 +27,58 @@ import numpy as np
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError
 from pipeline.core.records import (
     BASE,
+    BASE_COUNT,
     BASE_NAMES,
+    LIMIT,
     NORMAL,
     SENSORS,
     Contribution,
     CorrectionStep,
     Estimate,
     FittedEffect,
-    MonteCarlo,
-    NotIncluded,
-    Recording,
+    Multiply,
+    NoiseParts,
     SensorCalibration,
     StageDetails,
     StageResult,
+    Subtract,
     UnitRecordings,
     Values,
-    motion_at_rest,
-    once_of_log,
+    base_values,
 )
-from pipeline.estimation.uncertainty_budget import with_uncertainty
-from pipeline.physics.effects.base import with_truth
-from pipeline.physics.measurement import SensorEffects, compensate
-from pipeline.physics.signal.filters import temperature_of
+from pipeline.estimation.engine import ScaledColumns, linear_convergence
+from pipeline.estimation.gauss_markov import block_covariance
+from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
+from pipeline.estimation.multi_position.model import motion_at_rests
+from pipeline.estimation.noise import wander_prior
+from pipeline.estimation.rest_means import rests_of
+from pipeline.estimation.table_errors import type_b
+from pipeline.estimation.uncertainty_budget import (
+    GRAVITY,
+    TEMPERATURE,
+    base_parameters,
+    centred,
+    combined,
+    keep_larger,
+    limited_effects,
+    scatter_contribution,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.core.records import UnitRecordings
+    from pipeline.core.records import Index, Noise, UnitRecordings
     from pipeline.core.settings import DataSheet, Method, Settings
     from pipeline.estimation.engine import ResidualNoise
+    from pipeline.estimation.gauss_markov import WanderPrior
+    from pipeline.estimation.rest_means import Rests
 
 
-SOURCE = "known effects"  # of the uncertainty budget
 GIVEN, GIVEN_SOURCE = "given", "given calibration"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
 MOST_PASSES = 4  # each reduces the error of the known effects by their share of the reading, at most a hundredth
 SETTLED = 1e-6  # change of bias, g or deg/s, and matrix in a pass: the known effects change by a hundredth of it
 Change: TypeAlias = Literal["readings", "bias", "matrix", "effects"]
-
-
-def known_effects(sensor: str, method: Method) -> tuple[FittedEffect, ...]:
-    """Return the effects that the method of a sensor knows before the fit (``method.known``)."""
-    entries = [] if method.known is None else method.known.get(sensor, [])
-    return tuple(FittedEffect.from_json(entry) for entry in entries)
-
-
-def subtracted(
-    recordings: Sequence[Recording],
-    calibration: SensorCalibration,
-    known: Sequence[FittedEffect],
-    needed: Sequence[str] = (),
-) -> list[Recording]:
-    """Return the recordings with the known effects subtracted from the readings of the calibration's sensor.
-
-    ``calibration``: its bias and matrix are used. A recording without a temperature loses the readings of this sensor;
-    raises ``CannotCalibrateError`` if its role is one of ``needed``.
-    """
-    sensor, part, found = calibration.sensor, SensorEffects.of(calibration, known), []
-    for recording in recordings:
-        reading = recording.reading(sensor)
-        if reading is None:
-            found.append(recording)
-            continue
-        if recording.temperature is None:
-            if recording.role in needed:
-                raise CannotCalibrateError(
-                    f"{recording.name} logs no temperature, which the known {_names(known)} of the {sensor} need: "
-                    "record it, or choose a method without known effects"
-                )
-            found.append(recording.with_readings(**{sensor: None}))
-            continue
-        motion = replace(motion_at_rest(recording.time), temperature=temperature_of(recording))
-        truth = compensate(calibration, reading, motion, known)
-        corrected = part.take_off(reading, with_truth(motion, sensor, truth))
-        found.append(recording.with_readings(**{sensor: _readings(recording, corrected.tobytes())}))
-    return found
-
-
-@once_of_log
-def _readings(recording: Recording, values: bytes) -> Values:
-    """Return corrected readings; equal ones are one object, so that what follows from them is computed once."""
-    return np.frombuffer(values).reshape(recording.samples, 3)
-
-
-def with_known(
-    calibration: SensorCalibration, known: Sequence[FittedEffect], stages: Sequence[StageResult]
-) -> SensorCalibration:
-    """Return a calibration by corrected readings with the known effects, and the results of the stages that state them.
-
-    The known parameters have no uncertainty, which the budget states.
-    """
-    values = {effect.name: effect.values for effect in known}
-    fitted = [_moved(e, values[e.name]) if e.name in values else e for e in calibration.effects]
-    more = [effect for effect in known if effect.name not in {e.name for e in fitted}]
-    found = replace(calibration, effects=(*fitted, *more), stages=(*stages, *calibration.stages))
-    if calibration.covariance is None or calibration.budget is None:
-        return found
-    size, added = len(calibration.covariance), [p for effect in more for p in effect.parameters.values()]
-    covariance = np.pad(calibration.covariance, (0, len(added)))
-    freedom = np.pad(calibration.parameters.degrees_of_freedom, (0, len(added)), constant_values=np.inf)
-    budget = calibration.budget.at([*range(size), *[None] * len(added)])
-    if isinstance(budget.monte_carlo, MonteCarlo):
-        budget = replace(budget, monte_carlo=replace(budget.monte_carlo, estimate=found.parameters.values))
-    reason = f"no uncertainty of the known {_names(known)} is stated: zeros stand for it"
-    budget = replace(budget, not_included=(*budget.not_included, NotIncluded(SOURCE, reason)))
-    return with_uncertainty(found, covariance, freedom, budget)
-
-
-def _names(known: Sequence[FittedEffect]) -> str:
-    return " and ".join(effect.name for effect in known)
-
-
-def without_known(calibration: SensorCalibration, known: Sequence[FittedEffect]) -> SensorCalibration:
-    """Return the calibration of readings from which the known effects are subtracted: undoes ``with_known``."""
-    values, parameters = {effect.name: effect.values for effect in known}, calibration.parameters
-    effects, names = [], list(BASE_NAMES)
-    for effect in calibration.effects:
-        own = parameters.select(parameters.of_effect(effect.name))
-        left = _moved(effect, -values[effect.name]) if effect.name in values else effect
-        if effect.name not in values or np.any(left.values) or np.any(own.standard_uncertainty):
-            effects.append(left)
-            names += own.names
-    rows = parameters.places(names)
-    freedom = None if calibration.freedom is None else calibration.freedom[rows]
-    budget = calibration.budget and calibration.budget.at(rows.tolist())
-    covariance = parameters.select(rows).covariance
-    return replace(calibration, effects=tuple(effects), covariance=covariance, freedom=freedom, budget=budget)
-
-
-def _moved(effect: FittedEffect, by: Values) -> FittedEffect:
-    """Return an effect that is linear in its parameters with other values."""
-    return effect.at((effect.values + by).tolist())
-
-
-def without_known_effects(
-    recordings: UnitRecordings, calibrations: Mapping[str, SensorCalibration | None], method: Method
-) -> tuple[UnitRecordings, dict[str, SensorCalibration | None]]:
-    """Return the recordings of a unit less the known effects of both sensors, and calibrations of these readings."""
-    filtered, found = recordings.filtered, dict(calibrations)
-    for sensor, calibration in calibrations.items():
-        known = known_effects(sensor, method)
-        if calibration is not None and known:
-            filtered = subtracted(filtered, calibration, known)
-            found[sensor] = without_known(calibration, known)
-    return replace(recordings, filtered=filtered), found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,6 +96,199 @@ class FitStage:
     free: bool = False  # estimates each element of bias and matrix freely; else the verdict may blame the method
     reference: bool = False  # the fit with which the diagnosis compares the other methods on a table
     known: Callable[[str, DataSheet], list[FittedEffect]] | None = None  # of a stage that changes the readings
+
+
+@dataclass(frozen=True)
+class StageInput:
+    """What a stage gets."""
+
+    sensor: str
+    recordings: UnitRecordings  # all of the unit, with the noise of each sensor; a stage uses those of its roles
+    previous: SensorCalibration | None  # the result of the stage before; None for the first
+    settings: Settings
+    stage: str = ""  # its name, for a module of several stages
+
+    @property
+    def noise(self) -> Noise | None:
+        """The noise of the sensor; None: the recordings do not show it."""
+        return self.recordings.noises[self.sensor]
+
+    @property
+    def data_sheet(self) -> DataSheet:
+        """The figures of the sensor."""
+        return self.settings.sensor.of(self.sensor)
+
+    @property
+    def prior(self) -> WanderPrior:
+        """The bias instability before the fit."""
+        return wander_prior(self.noise, self.data_sheet)
+
+    @property
+    def stages(self) -> tuple[StageResult, ...]:
+        """The results of the stages before."""
+        return self.previous.stages if self.previous else ()
+
+    @property
+    def rests(self) -> Rests:
+        """The rests of the fit; raises ``CannotCalibrateError`` if there is none."""
+        found = rests_of(self.sensor, self.recordings.filtered, self.settings.procedure)
+        if found is None or found.held_out.all():
+            raise CannotCalibrateError(f"no rest of the {self.sensor} was found: record rests")
+        return found.select(~found.held_out)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageOutput:
+    """What a free fit of some elements of bias and matrix to rests returns: n equations with p estimated elements.
+
+    ``fit_stage`` makes the calibration of it. The errors of the estimates are those of a least-squares fit with equal
+    weights, ``-J^+ D``, with the derivative J of the residuals with respect to the estimates, and their change D by the
+    noise of the rests, by elements that are not estimated, or by an effect. So it states covariance, degrees of freedom
+    and budget; an element that no stage estimates has the uncertainty of the sensor file's limit; and what effects at
+    their limits would change. Raises ``NotObservableError`` if the equations do not determine the estimates.
+
+    The bias of the accelerometer, by the length of gravity at rest:
+
+    >>> def fit(task: StageInput) -> StageOutput:
+    ...     rests, g, bias = task.rests, task.settings.table.gravity_g, np.zeros(3)
+    ...     for _ in range(10):  # Gauss-Newton
+    ...         force = rests.reading - bias
+    ...         residual = np.sum(force**2, axis=1) - g**2
+    ...         bias = bias + np.linalg.lstsq(2.0 * force, residual)[0]
+    ...     return StageOutput(
+    ...         estimated=BIAS_NAMES, bias=bias, rests=rests, residual=residual, jacobian=-2.0 * force,
+    ...         by_reading=2.0 * force, by_gravity=np.full(len(residual), -2.0 * g),
+    ...     )
+    >>> found = fit(task).calibration(task)  # of a simulated unit with the bias 0.05, -0.02, 0.01 g
+    >>> np.abs(found.bias - [0.05, -0.02, 0.01]) < found.parameters.expanded_uncertainty[:3]
+    array([ True,  True,  True])
+    >>> [line.source for line in found.lines]
+    ['noise of the readings', 'not determined by the recordings: limit of the sensor file', 'local gravity']
+    """
+
+    estimated: Sequence[str]  # names of BASE_NAMES
+    bias: Values  # (3,), g or deg/s
+    matrix: Values | None = None  # (3, 3); None: that of the stage before
+    rests: Rests
+    residual: Values  # (n,)
+    jacobian: Values  # (n, p), of the residuals with respect to the estimated elements
+    by_reading: Values  # (n, 3), of the residuals with respect to the mean reading of their rest
+    by_gravity: Values | None = None  # (n,), with respect to local gravity, where an equation contains it
+    row: Index | None = None  # (n,), rest of each equation; None: each has one
+    details: StageDetails = field(default_factory=StageDetails)
+
+    def calibration(self, task: StageInput) -> SensorCalibration:
+        """Return the calibration after the stage, with its uncertainty."""
+        before = task.previous or SensorCalibration(task.sensor)
+        matrix = before.matrix if self.matrix is None else self.matrix
+        columns = ScaledColumns.of(self.jacobian)
+        columns.require_full_rank(list(self.estimated))
+        gain, place = -columns.weights(), before.parameters.places(self.estimated)
+        by_element, rest = self._by_element(matrix), np.setdiff1d(np.arange(BASE_COUNT), place)
+        known = np.zeros(BASE_COUNT) if task.previous is None else before.parameters.standard_uncertainty[BASE]
+        of_others = np.where(known > 0.0, known, limits_of_base(task.data_sheet))[rest]
+        noise = self._noise(task, gain, place, np.sum((by_element[:, rest] * of_others) ** 2, axis=1))
+        change = np.eye(BASE_COUNT)  # of all elements by errors of those that are not estimated
+        change[place] = gain @ by_element
+        change[:, place] = 0.0
+        lines, missing = [noise], {"temperature": TEMPERATURE}
+        if len(kept := rest[known[rest] > 0.0]):
+            own = np.asarray(before.parameters.select(kept).covariance)
+            covariance = change[:, kept] @ own @ change[:, kept].T
+            freedom = np.full(BASE_COUNT, float(before.parameters.degrees_of_freedom[kept].min()))
+            lines.append(Contribution("stages before", "A", "Student's t", covariance, freedom))
+        if len(left := rest[known[rest] == 0.0]):
+            by_limit = change[:, left] * limits_of_base(task.data_sheet)[left]
+            remark, freedom = ", ".join(BASE_NAMES[k] for k in left), np.full(BASE_COUNT, np.inf)
+            lines.append(Contribution(LIMIT, "B", NORMAL, by_limit @ by_limit.T, freedom, remark=remark))
+        u = task.settings.table.gravity_accuracy_g
+        if self.by_gravity is not None and u:
+            lines.append(type_b(GRAVITY, NORMAL, u, "g", _at_places(place, (gain @ self.by_gravity)[:, None])))
+        elif self.by_gravity is not None and u is None:
+            missing[GRAVITY] = "table.gravity_accuracy_g is not stated"
+        parameters = base_parameters(task.sensor, self.bias, matrix, noise.covariance)
+        details = replace(self.details, rests=len(self.rests.time), condition=columns.condition)
+        rms = float(np.sqrt(np.mean(self.residual**2)))
+        correction = Subtract(self.bias), Multiply(matrix)
+        result = StageResult(task.stage, {n: parameters[n] for n in self.estimated}, rms, correction, details)
+        found = SensorCalibration(
+            task.sensor,
+            self.bias,
+            matrix,
+            stages=(*task.stages, result),
+            convergence=linear_convergence(self.jacobian, self.residual, columns.condition, columns.rank),
+            at_limits=self._at_limits(task, gain, place, matrix),
+        )
+        return combined(found, lines, missing)
+
+    def _by_rest(self, values: Values) -> Values:
+        """Return values of the rests, (m, ...), for each equation."""
+        return values if self.row is None else np.asarray(values[self.row])
+
+    def _noise(self, task: StageInput, gain: Values, place: Index, variance: Values) -> Contribution:
+        """Return the contribution of white noise and bias wander, widened where the residuals are larger.
+
+        ``variance``: (n,), of the residuals by what is not estimated.
+        """
+        rests, prior = self.rests, task.prior
+        white = rests.variance(rests.white if task.noise is None else task.noise.white)
+        wander = prior.wander**2 * block_covariance(rests.start, rests.length, prior.time)
+        wander = np.where(rests.recording[:, None] == rests.recording, wander, 0.0)
+        of_rests = np.eye(len(rests.time)) if self.row is None else np.eye(len(rests.time))[self.row]
+        by_source, expected = np.zeros((2, len(gain), len(gain))), variance
+        for c in range(3):
+            D = self.by_reading[:, c, None] * of_rests
+            A = gain @ D
+            by_source[0] += A @ np.diag(white[:, c]) @ A.T
+            by_source[1] += A @ wander @ A.T
+            expected = expected + np.einsum("nm,ml,nl->n", D, np.diag(white[:, c]) + wander, D)
+        freedom = len(self.residual) - len(gain)
+        of_noise = by_source.sum(axis=0)
+        ratio = float(np.sum(self.residual**2) / np.sum(expected)) * len(self.residual) / freedom if freedom else 1.0
+        parts = [*by_source, (max(ratio, 1.0) - 1.0) * of_noise]
+        u = NoiseParts(*(_at_places(place, np.sqrt(np.diag(part))[:, None])[:, 0] for part in parts))
+        covariance = np.zeros((BASE_COUNT, BASE_COUNT))
+        covariance[np.ix_(place, place)] = max(ratio, 1.0) * of_noise
+        return scatter_contribution(covariance, float(freedom) if freedom else np.inf, u)
+
+    def _by_element(self, matrix: Values) -> Values:
+        """Return the derivative of the residuals with respect to bias and matrix, as those of the readings: (n, 12).
+
+        A change e of the bias acts as one of a reading by -e, dM of the matrix by K dM (reading - bias).
+        """
+        off, K = self._by_rest(self.rests.reading) - self.bias, np.asarray(np.linalg.solve(matrix, np.eye(3)))
+        of_matrix = np.einsum("nc,ci,nj->nij", self.by_reading, K, off).reshape(-1, 9)
+        return np.concatenate([-self.by_reading, of_matrix], axis=1)
+
+    def _at_limits(self, task: StageInput, gain: Values, place: Index, matrix: Values) -> dict[str, Values]:
+        """Return the change of bias and matrix by each effect at its limits: (12, p)."""
+        rests, found = self.rests, dict[str, Values]()
+        force = rests.reading @ matrix.T
+        if task.sensor == "gyroscope":
+            of_force = rests_of("accelerometer", task.recordings.filtered, task.settings.procedure)
+            force = of_force.select(~of_force.held_out).reading if of_force is not None else np.zeros_like(force)
+            if len(force) != len(rests.time):  # other rests than those of the gyroscope
+                return {}
+        motion = centred([motion_at_rests(rests, force)])[0]
+        K = np.asarray(np.linalg.solve(matrix, np.eye(3)))
+        for this, start, limits in limited_effects(task.sensor, (), task.data_sheet):
+            if this.available(motion):
+                z = self._by_rest(this.columns(task.sensor, motion, K, start) * limits)
+                keep_larger(found, this.name, _at_places(place, gain @ np.einsum("nc,ncp->np", self.by_reading, z)))
+        return found
+
+
+def limits_of_base(data_sheet: DataSheet) -> Values:
+    """Return the standard uncertainty of bias and matrix, uniform within the sensor file's limits: (12,) array."""
+    matrix = np.where(np.eye(3, dtype=bool), data_sheet.scale_factor, data_sheet.cross_axis)
+    return np.asarray(base_values(np.full(3, data_sheet.bias), matrix) / np.sqrt(3.0), np.float64)
+
+
+def _at_places(place: Index, values: Values) -> Values:
+    """Return (p, m) values of some elements of bias and matrix as those of all: (12, m) array."""
+    found = np.zeros((BASE_COUNT, values.shape[1]))
+    found[place] = values
+    return found
 
 
 FIT_STAGES = {GIVEN: FitStage(changes=("bias", "matrix", "effects")), NOT_WANTED: FitStage()}
@@ -288,36 +374,40 @@ def fit_stage(
     if stage == GIVEN:
         return given_calibration(sensor, settings.method)
     check_stages(sensor, [*declarations(previous), stage] if previous else [stage])
-    module = import_module(stage_module(sensor, stage))
-    of_both = len(declared(sensor, stage).sensors) > 1 and f".{sensor}." not in module.__name__
-    fit = partial(module.fit, *((stage,) if len(module.FIT_STAGES) > 1 else (sensor,) if of_both else ()))
+    known = known_effects(sensor, settings.method)
+    if declared(sensor, stage).known:
+        named = [(f"{effect.name}.{name}", p) for effect in known for name, p in effect.parameters.items()]
+        parameters = {name: Estimate(p.value, p.unit) for name, p in named}
+        return SensorCalibration(sensor, effects=known, stages=(StageResult(stage, parameters),))
     for other in SENSORS:
         if other != sensor and (of_other := known_effects(other, settings.method)):
             filtered = subtracted(recordings.filtered, SensorCalibration(other), of_other, ("rests",))
             recordings = replace(recordings, filtered=filtered)
-    known = () if declared(sensor, stage).known else known_effects(sensor, settings.method)
-    if known and previous is not None:
-        return _fit_to_corrected(fit, recordings, previous, known, settings)
-    calibration: SensorCalibration = fit(recordings, previous, settings)
-    return calibration
+    fit = import_module(stage_module(sensor, stage)).fit
+    task = StageInput(sensor, recordings, previous, settings, stage)
+    return _fit_to_corrected(fit, task, previous, known) if known and previous is not None else _fitted(fit, task)
+
+
+def _fitted(fit: Callable[[StageInput], SensorCalibration | StageOutput], task: StageInput) -> SensorCalibration:
+    found = fit(task)
+    return found.calibration(task) if isinstance(found, StageOutput) else found
 
 
 def _fit_to_corrected(
-    fit: Callable[..., SensorCalibration],
-    recordings: UnitRecordings,
+    fit: Callable[[StageInput], SensorCalibration | StageOutput],
+    task: StageInput,
     previous: SensorCalibration,
     known: Sequence[FittedEffect],
-    settings: Settings,
 ) -> SensorCalibration:
     """Return the fit to the readings less the known effects, which depend on bias and matrix, with these effects."""
-    sensor, stages = previous.sensor, declarations(previous)
+    sensor, recordings, stages = task.sensor, task.recordings, declarations(previous)
     held = [s for s in previous.stages if s.name in stages and stages[s.name].known]
     before = without_known(previous, known)
     before = replace(before, stages=tuple(s for s in previous.stages if s not in held))
     at, passes = before, 0
     while True:
-        filtered = subtracted(recordings.filtered, at, known, (sensor, "rests"))
-        found = fit(replace(recordings, filtered=filtered), before if before.stages else None, settings)
+        filtered = replace(recordings, filtered=subtracted(recordings.filtered, at, known, (sensor, "rests")))
+        found = _fitted(fit, replace(task, recordings=filtered, previous=before if before.stages else None))
         if found is before:  # nothing to fit
             return previous
         passes += 1
@@ -338,8 +428,6 @@ def given_calibration(sensor: str, method: Method) -> SensorCalibration:
     Effects of mounting, place, table and timing belong to the bench of that calibration: they are not used, and the
     stage lists them. Raises ``CannotCalibrateError`` if the file has no calibration of the sensor.
     """
-    from pipeline.estimation.uncertainty_budget import base_parameters, combined  # noqa: PLC0415  (0.1 s of Snakemake)
-
     given = _given(method)
     part, source = given[sensor], given["source"]
     if part is None:

@@ -124,7 +124,7 @@ def limited_effects(
         yield from ((this, start, np.where(linear, limits[name], 0.0)) for start in this.starts(sensor))
 
 
-def _keep_larger(found: dict[str, Values], name: str, change: Values) -> None:
+def keep_larger(found: dict[str, Values], name: str, change: Values) -> None:
     """Keep the larger of two changes by an effect at different time constants."""
     if name not in found or np.abs(change).sum() > np.abs(found[name]).sum():
         found[name] = change
@@ -135,7 +135,7 @@ def changes_on_table(
 ) -> dict[str, Values]:
     """Return the change of bias and matrix by each effect at its limits, (12, p), of a fit on a table."""
     found: dict[str, Values] = {}
-    sensor, K, motions = reference.sensor, reference.K, _centred(reference.motions)
+    sensor, K, motions = reference.sensor, reference.K, centred(reference.motions)
     joined = joined_motions(motions)
     for this, start, limits in limited_effects(sensor, modelled, data_sheet):
         if not all(this.available(motion) for motion in motions):
@@ -145,11 +145,11 @@ def changes_on_table(
         else:
             columns = np.concatenate([this.columns(sensor, motion, K, start) for motion in motions])
         pairs = zip(fit.derivative, fit.weights, columns.transpose(1, 0, 2), strict=True)
-        _keep_larger(found, this.name, (sum(J @ (A @ z) for J, A, z in pairs) * limits)[BASE])
+        keep_larger(found, this.name, (sum(J @ (A @ z) for J, A, z in pairs) * limits)[BASE])
     return found
 
 
-def _centred(motions: Sequence[Motion]) -> list[Motion]:
+def centred(motions: Sequence[Motion]) -> list[Motion]:
     """Return the motions with the mean temperature to which effects refer."""
     known = [motion.temperature for motion in motions if motion.temperature is not None]
     shift = REFERENCE_TEMPERATURE - float(np.mean(np.concatenate(known))) if known else 0.0
@@ -173,7 +173,7 @@ def changes_by_hand(
     equations = model.equations(fitted.state, [EffectColumns(this, start) for this, start, _ in listed])
     found: dict[str, Values] = {}
     for (this, _, limits), columns in zip(listed, equations.candidates, strict=True):
-        _keep_larger(found, this.name, gain @ columns * limits)
+        keep_larger(found, this.name, gain @ columns * limits)
     return found
 
 
@@ -215,7 +215,7 @@ def changes_through_gravity(
     if model.moves is None or not accelerometer.at_limits:
         return {}
     rests, force, M = model.every, model.at_rests.force, accelerometer.matrix
-    motion = _centred([motion_at_rests(rests, force)])[0]
+    motion = centred([motion_at_rests(rests, force)])[0]
     by_force = np.einsum("pn,nmc->pmc", gain[:, model.of_moves], model.by_force(fitted.state))
     K = np.asarray(np.linalg.solve(M, np.eye(3)), np.float64)
     found: dict[str, Values] = {}
@@ -226,7 +226,7 @@ def changes_through_gravity(
         z = this.columns("accelerometer", motion, K, start) * limits
         df = np.einsum("ij,mjp->mip", M, z - own[BIAS])
         df += np.stack([(force @ K.T) @ matrix_of(change).T for change in own.T], axis=2)
-        _keep_larger(found, OF_ACCELEROMETER + this.name, np.einsum("pmc,mcq->pq", by_force, df))
+        keep_larger(found, OF_ACCELEROMETER + this.name, np.einsum("pmc,mcq->pq", by_force, df))
     return found
 
 

@@ -30,6 +30,7 @@ from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
+from pipeline.estimation.stages import StageInput
 from pipeline.evaluation.diagnosis.observability import not_observable
 from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.physics.effects import effect_from, forget, register
@@ -165,7 +166,7 @@ def test_a_static_recording_may_face_another_way_and_no_more(offset: float, verd
     sheet = SHEET.gyroscope.replaced(bias_wander=3e-4, counts_per_unit=1e5)
     noise = estimate_noise("gyroscope", recordings, sheet)
     of_unit = settings_of(settings("gyroscope"), sensor=SHEET.replaced(gyroscope=sheet), **method)
-    fitted = reference_least_squares.fit("gyroscope", with_noise(recordings, of_unit), None, of_unit)
+    fitted = reference_least_squares.fit(StageInput("gyroscope", with_noise(recordings, of_unit), None, of_unit))
     found = diagnose(fitted, recordings, noise, of_unit)
     assert found["verdict"] == verdict, found["reason"]
 
@@ -315,7 +316,9 @@ def test_recordings_without_a_table_cannot_be_diagnosed_and_say_so() -> None:
 def test_automatic_effects_are_fitted_and_the_diagnosis_tells_what_was_added() -> None:
     recordings = hidden("gyroscope", "g_sensitivity")
     calibration = fit_effects(
-        "gyroscope", with_noise(recordings, settings("gyroscope", "auto")), None, settings("gyroscope", "auto")
+        StageInput(
+            "gyroscope", with_noise(recordings, settings("gyroscope", "auto")), None, settings("gyroscope", "auto")
+        )
     )
     assert [e.name for e in calibration.effects] == ["g_sensitivity"]
     noise = estimate_noise("gyroscope", recordings, SHEET.gyroscope)

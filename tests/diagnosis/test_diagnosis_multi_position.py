@@ -16,6 +16,7 @@ from unit_settings import settings_of, with_noise
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.stages import StageInput
 from pipeline.evaluation.diagnosis.words import in_words
 from tests.published import diagnose, validate
 
@@ -193,7 +194,9 @@ def test_a_drift_that_a_short_recording_hides_is_given_the_time_that_shows_it() 
     """Drifts of half the limit: 4 of 16 are found in 8 minutes, 10 of 16 in 11, and 15 of 16 in 14."""
     drawn = draw(Hand(rests=20), 1)
     noise = estimate_noise("accelerometer", [drawn.recording], drawn.settings.sensor.accelerometer)
-    calibration = nonlinear_least_squares.fit(with_noise([drawn.recording], drawn.settings), None, drawn.settings)
+    calibration = nonlinear_least_squares.fit(
+        StageInput("accelerometer", with_noise([drawn.recording], drawn.settings), None, drawn.settings)
+    )
     found = diagnose(calibration, [drawn.recording], noise, drawn.settings)["not_observable"]
     (reason,) = [entry["reason"] for entry in found if entry["effect"] == "bias_drift"]
     (minutes,) = re.findall(r"within (\d+) min", reason)

@@ -12,6 +12,7 @@ from unit_settings import settings_of, with_noise
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.stages import StageInput
 from tests.published import diagnose
 
 REAL: dict[str, Any] = {"rests": 20, "vertical": 0.2, "tail_dps": (0.7, 3.0), "creep_dps": 0.03}
@@ -29,11 +30,13 @@ HIDDEN: list[tuple[str, str, dict[str, Any]]] = [
 def test_twenty_rests_name_what_is_hidden_and_nothing_else(sensor: str, name: str, effects: dict[str, Any]) -> None:
     drawn = draw(Hand(effects=effects, **REAL), 5)
     recordings, sheet = [drawn.recording], drawn.settings.sensor.of(sensor)
-    felt = nonlinear_least_squares.fit(with_noise(recordings, drawn.settings), None, drawn.settings)
+    felt = nonlinear_least_squares.fit(
+        StageInput("accelerometer", with_noise(recordings, drawn.settings), None, drawn.settings)
+    )
     found = (
         felt
         if sensor == "accelerometer"
-        else rests_and_moves.fit(with_noise(recordings, drawn.settings), None, drawn.settings)
+        else rests_and_moves.fit(StageInput("gyroscope", with_noise(recordings, drawn.settings), None, drawn.settings))
     )
     part = diagnose(found, recordings, estimate_noise(sensor, recordings, sheet), drawn.settings, felt)
     assert part["selected"] == ([name] if name else [])
@@ -57,7 +60,9 @@ def test_twenty_rests_name_what_is_hidden_and_nothing_else(sensor: str, name: st
 def test_advice_names_what_too_few_rests_cannot_tell_where_they_scatter() -> None:
     drawn = draw(Hand(effects={"quadratic": [0.003, -0.004, 0.003]}, **REAL), 11)
     recordings = [drawn.recording]
-    found = nonlinear_least_squares.fit(with_noise(recordings, drawn.settings), None, drawn.settings)
+    found = nonlinear_least_squares.fit(
+        StageInput("accelerometer", with_noise(recordings, drawn.settings), None, drawn.settings)
+    )
     noise = estimate_noise("accelerometer", recordings, drawn.settings.sensor.accelerometer)
     part = diagnose(found, recordings, noise, drawn.settings)
     assert part["selected"] == []

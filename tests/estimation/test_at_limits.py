@@ -11,6 +11,7 @@ from unit_settings import settings_of, with_noise
 
 from pipeline.core.records import BIAS, MATRIX, SensorCalibration, base_values
 from pipeline.estimation.reference_least_squares import fit as fit_on_table
+from pipeline.estimation.stages import StageInput
 from pipeline.physics.effects import effect
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
@@ -35,9 +36,9 @@ def fitted(sensor: str, by: str, name: str = "", of: str = "", share: float = 0.
     settings = settings_of(sensor=SENSOR, table=unit.table, procedure=unit.procedure)
     recordings = with_noise(simulate_unit(unit, 7, 0)[0], settings)
     return (
-        FITS[sensor].fit(recordings, None, settings)
+        FITS[sensor].fit(StageInput(sensor, recordings, None, settings))
         if by == "hand"
-        else fit_on_table(sensor, recordings, None, settings)
+        else fit_on_table(StageInput(sensor, recordings, None, settings))
     )
 
 

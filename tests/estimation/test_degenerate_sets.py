@@ -14,6 +14,7 @@ from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.core.records import Recording
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
 from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.estimation.stages import StageInput
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -46,18 +47,20 @@ def in_a_plane(count: int = 16, out_of_it: float = 0.0) -> np.ndarray:
 
 def test_rests_that_all_lie_in_one_plane_leave_the_axis_across_it_open() -> None:
     with pytest.raises(NotObservableError, match=r"bias_x|scale_factor_x") as refused:
-        fit(with_noise(at_rest_in(in_a_plane()), SETTINGS), None, SETTINGS)
+        fit(StageInput("accelerometer", with_noise(at_rest_in(in_a_plane()), SETTINGS), None, SETTINGS))
     assert "each axis up, down and level" in str(refused.value)
 
 
 @pytest.mark.parametrize("lean", [0.5, 2.0])
 def test_rests_that_nearly_lie_in_one_plane_are_refused_too(lean: float) -> None:
     with pytest.raises(NotObservableError, match=r"scale_factor_x"):
-        fit(with_noise(at_rest_in(in_a_plane(out_of_it=lean)), SETTINGS), None, SETTINGS)
+        fit(StageInput("accelerometer", with_noise(at_rest_in(in_a_plane(out_of_it=lean)), SETTINGS), None, SETTINGS))
 
 
 def test_rests_well_out_of_the_plane_are_answered_within_their_uncertainty() -> None:
-    found = fit(with_noise(at_rest_in(in_a_plane(24, out_of_it=50.0)), SETTINGS), None, SETTINGS)
+    found = fit(
+        StageInput("accelerometer", with_noise(at_rest_in(in_a_plane(24, out_of_it=50.0)), SETTINGS), None, SETTINGS)
+    )
     assert np.all(np.abs(found.bias - BIAS) < 4.0 * np.sqrt(np.diag(found.covariance)[:3]))
     assert found.convergence.rank == found.convergence.parameters
     assert 1.0 < found.convergence.condition < 100.0
@@ -69,7 +72,7 @@ def test_rests_in_one_direction_alone_are_refused() -> None:
     with pytest.raises(
         NotObservableError, match=r"bias_z, .*scale_factor_z.*each axis up, down and level, spread evenly"
     ):
-        fit(with_noise(at_rest_in(up), SETTINGS), None, SETTINGS)
+        fit(StageInput("accelerometer", with_noise(at_rest_in(up), SETTINGS), None, SETTINGS))
 
 
 def test_a_recording_without_a_rest_says_so() -> None:
@@ -77,7 +80,7 @@ def test_a_recording_without_a_rest_says_so() -> None:
     wave = np.column_stack([np.sin(3.1 * time), np.cos(2.3 * time), np.sin(1.7 * time + 1.0)])
     moving = Recording("recording", "rests", None, np.arange(3000) * 40_000_000, accelerometer=wave)
     with pytest.raises(NotObservableError, match="0 orientations determine neither bias nor scale factors") as refused:
-        fit(with_noise([moving], SETTINGS), None, SETTINGS)
+        fit(StageInput("accelerometer", with_noise([moving], SETTINGS), None, SETTINGS))
     assert "better in 24 that are spread evenly" in str(refused.value)
 
 
@@ -104,12 +107,12 @@ def turned_by_hand(axes: str, lost: str = "", seed: int = 1) -> list[Recording]:
 
 def test_moves_about_one_axis_alone_leave_the_gyroscope_without_a_vertical_that_is_known() -> None:
     with pytest.raises(CannotCalibrateError, match=r"direction of gravity.*nearly degenerate.*each axis up, down"):
-        rests_and_moves.fit(with_noise(turned_by_hand("x"), BOTH), None, BOTH)
+        rests_and_moves.fit(StageInput("gyroscope", with_noise(turned_by_hand("x"), BOTH), None, BOTH))
 
 
 def test_moves_of_which_only_those_about_one_axis_are_whole_are_refused() -> None:
     with pytest.raises(CannotCalibrateError, match=r"all were about one axis: record some 24 rests.*changing axes"):
-        rests_and_moves.fit(with_noise(turned_by_hand("xyz", lost="yz"), BOTH), None, BOTH)
+        rests_and_moves.fit(StageInput("gyroscope", with_noise(turned_by_hand("xyz", lost="yz"), BOTH), None, BOTH))
 
 
 @pytest.mark.parametrize(("axes", "reason"), [("xy", "nearly degenerate"), ("xxxxxxxxxxxy", "too much alike")])
@@ -136,6 +139,6 @@ def test_a_gyroscope_whose_moves_do_not_determine_it_is_null_beside_its_accelero
 
 
 def test_moves_about_all_axes_are_answered() -> None:
-    found = rests_and_moves.fit(with_noise(turned_by_hand("xyz"), BOTH), None, BOTH)
+    found = rests_and_moves.fit(StageInput("gyroscope", with_noise(turned_by_hand("xyz"), BOTH), None, BOTH))
     assert found.convergence.rank == found.convergence.parameters == 12
     assert np.abs(found.matrix - np.eye(3)).max() < 0.01

@@ -13,7 +13,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.reference_least_squares import fit
-from pipeline.estimation.stages import fit_stage
+from pipeline.estimation.stages import StageInput, fit_stage
 from pipeline.estimation.table_errors import Reference, disturbance, table_errors
 from pipeline.physics.kinematics import table_motion
 from pipeline.simulation.campaign import simulate_unit
@@ -43,7 +43,7 @@ def _ratios(found: list[SensorCalibration], true: list[np.ndarray]) -> np.ndarra
 
 @pytest.mark.parametrize(("sensor", "shown"), [("accelerometer", 3.0), ("gyroscope", 1.0)])
 def test_the_noise_of_the_readings_is_the_sensor_s_and_not_the_table_s(sensor: str, shown: float) -> None:
-    found = [fit(sensor, with_noise(_unit(n)[0], SETTINGS), None, SETTINGS) for n in range(UNITS)]
+    found = [fit(StageInput(sensor, with_noise(_unit(n)[0], SETTINGS), None, SETTINGS)) for n in range(UNITS)]
     white = np.array([f.stages[-1].details.white_noise for f in found])
     true = _unit(0)[1][sensor]["noise"]["white"]
     residual = np.array([f.stages[-1].details.residual_rms for f in found])
@@ -56,7 +56,10 @@ def test_the_noise_of_the_readings_is_the_sensor_s_and_not_the_table_s(sensor: s
 
 
 def test_the_length_of_gravity_is_not_charged_with_errors_of_the_attitude() -> None:
-    found = [nonlinear_least_squares.fit(with_noise(_unit(n)[0], SETTINGS), None, SETTINGS) for n in range(UNITS)]
+    found = [
+        nonlinear_least_squares.fit(StageInput("accelerometer", with_noise(_unit(n)[0], SETTINGS), None, SETTINGS))
+        for n in range(UNITS)
+    ]
     true = []
     for n in range(UNITS):
         hidden = _unit(n)[1]["accelerometer"]
@@ -84,7 +87,9 @@ def test_an_effect_fitted_to_turns_of_different_speed_errors_leaves_the_bias_wit
 def test_an_accuracy_that_does_not_touch_the_gyroscope_changes_nothing() -> None:
     plain = SETTINGS.replaced(table=settings_of().table)
     level = settings_of(plain, **{"table.levelling_deg": 5.0})
-    first, second = (fit("gyroscope", with_noise(_unit(0)[0], settings), None, settings) for settings in (plain, level))
+    first, second = (
+        fit(StageInput("gyroscope", with_noise(_unit(0)[0], settings), None, settings)) for settings in (plain, level)
+    )
     np.testing.assert_array_equal(np.asarray(first.covariance), np.asarray(second.covariance))
 
 

@@ -21,6 +21,7 @@ from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.ranking import Ranking
 from pipeline.estimation.selection import select
+from pipeline.estimation.stages import StageInput
 from pipeline.physics.effects import effect
 from pipeline.physics.signal.filters import apply_filter
 from pipeline.simulation.description import shipped_settings
@@ -84,7 +85,7 @@ def test_the_uncertainty_of_a_matrix_far_from_one_is_that_of_drawn_inverses() ->
 
 def test_the_stage_passes_on_what_was_there_where_no_effect_is_asked_for() -> None:
     before = SensorCalibration("accelerometer", bias=np.ones(3))
-    assert fit_effects("accelerometer", with_noise([], SETTINGS), before, SETTINGS) is before
+    assert fit_effects(StageInput("accelerometer", with_noise([], SETTINGS), before, SETTINGS)) is before
 
 
 def test_a_known_filter_acts_on_the_reference_too() -> None:

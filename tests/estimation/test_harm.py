@@ -16,6 +16,7 @@ from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
+from pipeline.estimation.stages import StageInput
 from pipeline.evaluation.diagnosis import turntable
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def test_what_a_knock_imitates_is_neither_offered_nor_added_where_nothing_is_hel
     harmful = turntable.harmful_effects(selection, harm.fits_of(selection), [])
     assert ("cubic_nonlinearity" in selection.names, "cubic_nonlinearity" in harmful) == (knocked, knocked)
     assert all("stretches of turns that the fit leaves out" in reason for reason in harmful.values())
-    added = effects.fit("gyroscope", with_noise(recordings, SETTINGS), None, SETTINGS)
+    added = effects.fit(StageInput("gyroscope", with_noise(recordings, SETTINGS), None, SETTINGS))
     assert [e.name for e in added.effects] == [name for name in selection.names if name not in harmful]
     assert knocked or selection.names == ["g_sensitivity"]
 
@@ -57,7 +58,7 @@ def test_auto_by_hand_leaves_out_what_raises_the_error_in_left_out_rests(monkeyp
     unit = hand_held(effects={"gyroscope.g_sensitivity": None})
     recordings: UnitRecordings = with_noise(unit.recordings, unit.settings)
     settings = settings_of(table="hand", procedure={"holdout_every": 3}, effects={"gyroscope": "auto"})
-    before = rests_and_moves.fit(recordings, None, settings)
+    before = rests_and_moves.fit(StageInput("gyroscope", recordings, None, settings))
     seen: list[tuple[SelectionByHand, harm.LeftOut]] = []
 
     def judged(selection: SelectionByHand, parts: Any) -> harm.LeftOut:
@@ -65,10 +66,12 @@ def test_auto_by_hand_leaves_out_what_raises_the_error_in_left_out_rests(monkeyp
         return seen[-1][1]
 
     monkeypatch.setattr(effects, "left_out", judged)
-    assert [e.name for e in effects.fit("gyroscope", recordings, before, settings).effects] == ["g_sensitivity"]
+    assert [e.name for e in effects.fit(StageInput("gyroscope", recordings, before, settings)).effects] == [
+        "g_sensitivity"
+    ]
     ((selection, errors),) = seen
     assert len(errors.of_rests[0]) == len(selection.model.rests.time)  # none that is held out of the published fit
     assert errors.errors[1] < errors.errors[0]
     worse = replace(errors, of_rests=errors.of_rests[::-1], of_moves=errors.of_moves[::-1])
     monkeypatch.setattr(effects, "left_out", lambda *_: worse)
-    assert effects.fit("gyroscope", recordings, before, settings) is before
+    assert effects.fit(StageInput("gyroscope", recordings, before, settings)) is before

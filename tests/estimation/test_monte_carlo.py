@@ -16,6 +16,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.engine import ErrorMixture
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
+from pipeline.estimation.stages import StageInput
 from pipeline.output.pages.pages import monte_carlo_of
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
@@ -98,9 +99,13 @@ def test_methods_by_hand_and_on_a_table_run_it_beside_their_budget() -> None:
     turns, _ = simulate_unit(UnitDescription("U", course=course), 3, 0)
     settings = settings_of(unit.settings, table="acutronic")
     found = [
-        nonlinear_least_squares.fit(with_noise(unit.recordings, unit.settings), None, asked(unit.settings)),
-        rests_and_moves.fit(with_noise(unit.recordings, unit.settings), None, asked(unit.settings)),
-        reference_least_squares.fit("accelerometer", with_noise(turns, settings), None, asked(settings)),
+        nonlinear_least_squares.fit(
+            StageInput("accelerometer", with_noise(unit.recordings, unit.settings), None, asked(unit.settings))
+        ),
+        rests_and_moves.fit(
+            StageInput("gyroscope", with_noise(unit.recordings, unit.settings), None, asked(unit.settings))
+        ),
+        reference_least_squares.fit(StageInput("accelerometer", with_noise(turns, settings), None, asked(settings))),
     ]
     for calibration in found:
         budget = calibration.to_json()["uncertainty_budget"]
@@ -119,7 +124,9 @@ def test_methods_by_hand_and_on_a_table_run_it_beside_their_budget() -> None:
 def test_in_six_positions_the_squares_of_the_misalignments_are_in_both() -> None:
     unit = hand_held("mpu6050", 3, procedure="six_positions", holdout_every=0)
     recordings = with_noise(unit.recordings, unit.settings)
-    budget = nonlinear_least_squares.fit(recordings, None, asked(unit.settings)).to_json()["uncertainty_budget"]
+    budget = nonlinear_least_squares.fit(StageInput("accelerometer", recordings, None, asked(unit.settings))).to_json()[
+        "uncertainty_budget"
+    ]
     run, u = budget["monte_carlo"], np.array(budget["standard_uncertainty"])
     known = u > 0.0
     shift = np.array(run["mean"]) - run["estimate"]  # half the variance of a misalignment, which is not corrected
@@ -133,5 +140,7 @@ def test_without_the_switch_there_is_no_run() -> None:
     recordings = with_noise(unit.recordings, unit.settings)
     assert (
         "monte_carlo"
-        not in nonlinear_least_squares.fit(recordings, None, unit.settings).to_json()["uncertainty_budget"]
+        not in nonlinear_least_squares.fit(StageInput("accelerometer", recordings, None, unit.settings)).to_json()[
+            "uncertainty_budget"
+        ]
     )

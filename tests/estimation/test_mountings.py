@@ -17,6 +17,7 @@ from pipeline.checks.mounting import check_mounting
 from pipeline.core.records import Coefficient, FittedEffect, Noise, Recording, SensorCalibration, UnitRecordings
 from pipeline.estimation.effects import fit
 from pipeline.estimation.reference_least_squares import fit as fit_to_reference
+from pipeline.estimation.stages import StageInput
 from pipeline.physics.effects import effect, effect_of
 from pipeline.physics.kinematics import reference_motion
 
@@ -64,7 +65,7 @@ def test_gravity_determines_the_mountings_of_both_sensors_to_their_uncertainty()
     for seed in range(4):
         recordings, seats = seated_anew(seed, 1.0)
         for sensor, z in found.items():
-            calibrated = fit(sensor, UnitRecordings(recordings, NOISES), None, settings())
+            calibrated = fit(StageInput(sensor, UnitRecordings(recordings, NOISES), None, settings()))
             z.append(errors_over_u(calibrated, seats))
             (mounting,) = calibrated.effects
             assert mounting.name == "mounting"
@@ -82,7 +83,7 @@ def test_recordings_of_one_setup_share_a_mounting_and_the_gyroscope_is_better_kn
     clamped = [replace(r, setup=f"on_{axis}") for r, (_, axis) in zip(made, TURNS, strict=True)]
     u = {}
     for name, recordings in (("apart", made), ("shared", clamped)):
-        found = fit("gyroscope", UnitRecordings(recordings, NOISES), None, settings())
+        found = fit(StageInput("gyroscope", UnitRecordings(recordings, NOISES), None, settings()))
         assert np.abs(errors_over_u(found, seats)).max() < 4.0
         assert found.covariance is not None
         u[name] = np.sqrt(np.diag(found.covariance)[3:12].reshape(3, 3)[~np.eye(3, dtype=bool)])
@@ -94,8 +95,8 @@ def test_recordings_of_one_setup_share_a_mounting_and_the_gyroscope_is_better_kn
 
 def test_a_mounting_is_as_uncertain_for_the_gyroscope_as_gravity_leaves_it() -> None:
     recordings, _ = seated_anew(0, 3.0)
-    by_gravity = fit("accelerometer", UnitRecordings(recordings, NOISES), None, settings())
-    found = fit("gyroscope", UnitRecordings(recordings, NOISES), None, settings())
+    by_gravity = fit(StageInput("accelerometer", UnitRecordings(recordings, NOISES), None, settings()))
+    found = fit(StageInput("gyroscope", UnitRecordings(recordings, NOISES), None, settings()))
     assert by_gravity.covariance is not None
     of_turns = np.sqrt(np.diag(by_gravity.covariance)[12:]).reshape(6, 3)[3:]
     across = ~np.eye(3, dtype=bool)  # a rotation about the turn axis does not change the rate
@@ -111,9 +112,9 @@ def test_a_mounting_is_as_uncertain_for_the_gyroscope_as_gravity_leaves_it() -> 
 def test_the_tilt_that_looks_like_a_zero_of_one_shaft_does_not_widen_the_matrix(azimuth_of: str, *, held: bool) -> None:
     recordings, seats = seated_anew(0, 1.0)
     whole = settings(azimuth_of=azimuth_of)
-    plain = fit("accelerometer", UnitRecordings(recordings, NOISES), None, whole)
+    plain = fit(StageInput("accelerometer", UnitRecordings(recordings, NOISES), None, whole))
     whole = settings_of(whole, effects={"accelerometer": ["table_tilt"]})
-    tilted = fit("accelerometer", UnitRecordings(recordings, NOISES), None, whole)
+    tilted = fit(StageInput("accelerometer", UnitRecordings(recordings, NOISES), None, whole))
     assert plain.covariance is not None
     assert tilted.covariance is not None
     u, wider = (np.sqrt(np.diag(found.covariance)) for found in (plain, tilted))
@@ -129,7 +130,7 @@ def test_the_tilt_that_looks_like_a_zero_of_one_shaft_does_not_widen_the_matrix(
         assert why["levelling"].startswith("table_tilt estimates the component across the shaft alone")
         assert abs(d[1]) < 4.0 * wider[-1]  # the part across the shaft is estimated; the truth is 0
         whole = settings_of(whole, table={"levelling_deg": 0.1})
-        stated = fit("accelerometer", UnitRecordings(recordings, NOISES), None, whole)
+        stated = fit(StageInput("accelerometer", UnitRecordings(recordings, NOISES), None, whole))
         assert stated.covariance is not None
         assert np.sqrt(stated.covariance[-2, -2]) == pytest.approx(0.1, rel=0.01)
     else:
@@ -142,7 +143,9 @@ def test_without_mountings_the_same_turns_leave_a_wrong_matrix() -> None:
     plain = settings(seat_deg="null")
     assert (
         np.abs(
-            errors_over_u(fit_to_reference("gyroscope", UnitRecordings(recordings, NOISES), None, plain), seats)
+            errors_over_u(
+                fit_to_reference(StageInput("gyroscope", UnitRecordings(recordings, NOISES), None, plain)), seats
+            )
         ).max()
         > 20.0
     )
@@ -152,7 +155,7 @@ def test_without_an_accelerometer_the_mountings_stay_as_uncertain_as_their_prior
     recordings = [r for r in seated_anew(0, 1.0)[0] if r.role == "gyroscope"]
     blind = [replace(r, accelerometer=None) for r in recordings]
     whole = settings()
-    found = fit("gyroscope", UnitRecordings(blind, NOISES), None, whole)
+    found = fit(StageInput("gyroscope", UnitRecordings(blind, NOISES), None, whole))
     assert found.covariance is not None
     u = np.sqrt(np.diag(found.covariance)[3:12].reshape(3, 3)[~np.eye(3, dtype=bool)])
     assert np.all(u > 0.5 * np.radians(SEAT_DEG))
@@ -164,7 +167,7 @@ def test_a_zero_that_is_found_is_estimated_with_the_matrix() -> None:
         recordings = recordings_of({a: Setup(a, zero=37.0) for a in "xyz"}, seed)
         found = check_mounting(recordings, bench_settings(recordings))
         whole = settings(seat_deg="null")
-        calibrated = fit_to_reference("accelerometer", UnitRecordings(found, NOISES), None, whole)
+        calibrated = fit_to_reference(StageInput("accelerometer", UnitRecordings(found, NOISES), None, whole))
         assert [e.name for e in calibrated.effects] == ["encoder_zero"]
         z.append(errors_over_u(calibrated, np.zeros((1, 3))))
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.3

@@ -24,6 +24,7 @@ from pipeline.estimation.gauss_markov import (
 from pipeline.estimation.noise import estimate_noise, wander_prior
 from pipeline.estimation.noise_terms import allan_deviation
 from pipeline.estimation.reference_least_squares import fit
+from pipeline.estimation.stages import StageInput
 from pipeline.physics.signal.filters import apply_filter, filter_autocovariance
 
 SHEET = settings_of().sensor.accelerometer.replaced(noise_density=4e-4, bias_wander=1e-4, wander_time_s=100.0)
@@ -109,7 +110,9 @@ def test_values_held_between_samples_do_not_hide_a_slow_wander_from_the_stated_u
     config = unit_row(["sensor=mpu6050"]).config
     stated = [
         np.array(
-            fit("accelerometer", with_noise(of_unit, config), None, config).to_json()["expanded_uncertainty"]["bias"]
+            fit(StageInput("accelerometer", with_noise(of_unit, config), None, config)).to_json()[
+                "expanded_uncertainty"
+            ]["bias"]
         )
         for of_unit in (sampled, held)
     ]

@@ -11,6 +11,7 @@ from unit_settings import filter_of
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.core.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
 from pipeline.estimation.reference_least_squares import fit
+from pipeline.estimation.stages import StageInput
 from pipeline.physics.kinematics import attitude_matrix, reference_motion
 from pipeline.physics.signal.filters import apply_filter
 
@@ -95,7 +96,7 @@ def test_a_filter_that_cannot_be_rebuilt_leaves_the_shift_by_its_delay() -> None
         label = {"name": "analog", "delay_s": delay, "noise_gain": 1.0}
         late.append(replace(recording, accelerometer=bench.reading(force), filter=label))
     unit = UnitRecordings(late, {"accelerometer": None})
-    assert_exact(fit("accelerometer", unit, None, settings()), bench, 1e-9)
+    assert_exact(fit(StageInput("accelerometer", unit, None, settings())), bench, 1e-9)
     unaware = [replace(r, filter={"name": "none", "delay_s": 0.0, "noise_gain": 1.0}) for r in late]
     assert np.max(np.abs(calibrate("accelerometer", unaware).matrix - MATRIX)) > 0.05
 

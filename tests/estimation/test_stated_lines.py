@@ -19,6 +19,7 @@ from pipeline.checks.reference_scale import rate_error
 from pipeline.core.records import Coefficient, FittedEffect, Noise, Note, UnitRecordings
 from pipeline.core.settings import Settings
 from pipeline.estimation import reference_least_squares
+from pipeline.estimation.stages import StageInput
 from pipeline.estimation.stated_lines import with_stated
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.ingest.arrow import to_parquet
@@ -39,7 +40,9 @@ WARM = (20.0, 26.0)  # degC, from the first sample to the last of each recording
 def fitted() -> tuple[SensorCalibration, UnitRecordings]:
     turns = Bench("gyroscope", [0.3, -0.2, 0.5], K, white=0.01).turns_at([60.0, -60.0])
     warm = [replace(r, temperature=np.linspace(*WARM, r.samples)) for r in turns]
-    return reference_least_squares.fit("gyroscope", with_noise(warm, settings()), None, settings()), known(warm)
+    return reference_least_squares.fit(StageInput("gyroscope", with_noise(warm, settings()), None, settings())), known(
+        warm
+    )
 
 
 def known(recordings: list[Recording], noise: Noise | None = None) -> UnitRecordings:
@@ -143,7 +146,9 @@ def by_angle(sensor: str, *, counted: bool, **table: float) -> tuple[SensorCalib
     turns = [replace(r, table_rate=None, notes=(note,) if counted else ()) for r in turns]
     config = settings_of(settings(**table), **{f"sensor.{sensor}.effects.clock_rate": LIMIT_PPM})
     found = with_stated(
-        reference_least_squares.fit(sensor, with_noise(turns, config), None, config), with_noise(turns, config), config
+        reference_least_squares.fit(StageInput(sensor, with_noise(turns, config), None, config)),
+        with_noise(turns, config),
+        config,
     )
     return found, {entry["source"]: entry for entry in found.to_json()["uncertainty_budget"]["not_included"]}
 
@@ -170,7 +175,7 @@ def test_the_interval_of_samples_in_bursts_is_as_uncertain_as_their_number_leave
     bench = Bench("gyroscope", [0.03, -0.02, 0.05], K, white=0.001)
     plain = [replace(r, table_rate=None) for r in bench.turns_at([60.0, -60.0])]
     config = settings()
-    fit = reference_least_squares.fit("gyroscope", with_noise(plain, config), None, config)
+    fit = reference_least_squares.fit(StageInput("gyroscope", with_noise(plain, config), None, config))
     clocks = ({"interval_ns": 1e7, "uncertainty_ns": u} for u in (4e3, 6e3, 2e3))
     turns = [replace(r, source={**r.source, "bursts": clock}) for r, clock in zip(plain, clocks, strict=False)]
     found = with_stated(fit, with_noise(turns, config), config)
@@ -182,14 +187,14 @@ def test_the_interval_of_samples_in_bursts_is_as_uncertain_as_their_number_leave
     assert any(entry["source"] == "time base" for entry in found.to_json()["uncertainty_budget"]["not_included"])
     stated = settings(clock_accuracy_ppm=20.0)
     both = with_stated(
-        reference_least_squares.fit("gyroscope", with_noise(turns, stated), None, stated),
+        reference_least_squares.fit(StageInput("gyroscope", with_noise(turns, stated), None, stated)),
         with_noise(turns, stated),
         stated,
     )
     assert line(both, "interval of bursts")["standard_uncertainty"] == pytest.approx(300.0)
     rated = [replace(r, source=t.source) for r, t in zip(bench.turns_at([60.0, -60.0]), turns, strict=False)]
     by_rate = with_stated(
-        reference_least_squares.fit("gyroscope", with_noise(rated, config), None, config),
+        reference_least_squares.fit(StageInput("gyroscope", with_noise(rated, config), None, config)),
         with_noise(rated, config),
         config,
     )
@@ -202,7 +207,7 @@ def test_a_rate_that_is_not_the_change_of_its_angle_is_in_the_uncertainty() -> N
     turns, off = Bench("gyroscope", [0.3, -0.2, 0.5], K, white=0.001).turns_at([60.0, -60.0]), 1.5e-4
     turns = [replace(r, table_rate=(1.0 + off) * r.table_rate) for r in turns]
     config = settings(rate_accuracy=5e-6)
-    fit = reference_least_squares.fit("gyroscope", with_noise(turns, config), None, config)
+    fit = reference_least_squares.fit(StageInput("gyroscope", with_noise(turns, config), None, config))
     truth, different = np.linalg.inv(K), rate_error(turns, config.table)
     assert different == pytest.approx(off, rel=0.01)
     found = with_stated(fit, with_noise(turns, config), config, different).to_json()

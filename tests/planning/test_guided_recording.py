@@ -25,6 +25,7 @@ from pipeline.app.planning.guide import (
 from pipeline.app.planning.guide import progress_of as progress_of_unit
 from pipeline.core.records import Recording, SensorCalibration
 from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.stages import StageInput
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
@@ -130,7 +131,7 @@ def test_the_plan_starts_from_the_covariance_of_the_fit_while_a_misalignment_is_
         log = [recorded(attitudes()[:10], np.random.default_rng(seed))]
         progress, found = (
             progress_of(log, SETTINGS, DWELL),
-            nonlinear_least_squares.fit(with_noise(log, SETTINGS), None, SETTINGS),
+            nonlinear_least_squares.fit(StageInput("accelerometer", with_noise(log, SETTINGS), None, SETTINGS)),
         )
         assert progress.reason == "10 orientations leave misalignment_zy open"
         assert found.covariance is not None

@@ -18,6 +18,7 @@ from pipeline.checks.mounting import check_mounting, words
 from pipeline.core.errors import IngestError
 from pipeline.core.records import Recording
 from pipeline.estimation.reference_least_squares import fit
+from pipeline.estimation.stages import StageInput
 from pipeline.physics.kinematics import reference_motion
 
 LEVEL = [
@@ -69,7 +70,7 @@ def test_a_stated_bench_calibrates_within_the_expanded_uncertainty() -> None:
         recordings = recordings_of(setups, seed)
         checked = check_mounting(recordings, settings_of(recordings, setups))
         for sensor in ("accelerometer", "gyroscope"):
-            found = fit(sensor, unit_settings.with_noise(checked, settings), None, settings)
+            found = fit(StageInput(sensor, unit_settings.with_noise(checked, settings), None, settings))
             error = found.matrix - np.linalg.inv(TRUE_K[sensor])
             expanded = np.array(found.to_json()["expanded_uncertainty"]["matrix"])
             outside += int(np.sum(np.abs(error) > expanded))

@@ -13,6 +13,7 @@ from pipeline.core.records import Recording
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.stages import StageInput
 from pipeline.physics.signal.quiet_motion import creep_of_readings, posterior_creep_rates
 from pipeline.physics.signal.rests import Rest, find_rests
 from tests.published import validate
@@ -51,7 +52,9 @@ def test_a_creeping_unit_has_the_floor_and_the_errors_of_one_that_stands_still()
     figures: dict[float, list[float]] = {}
     for creep in (0.0, 0.15):
         drawn = draw(Hand(creep_dps=creep, white=QUIET), 6)
-        found = nonlinear_least_squares.fit(with_noise([drawn.recording], drawn.settings), None, drawn.settings)
+        found = nonlinear_least_squares.fit(
+            StageInput("accelerometer", with_noise([drawn.recording], drawn.settings), None, drawn.settings)
+        )
         noise = estimate_noise("accelerometer", [drawn.recording], drawn.settings.sensor.accelerometer)
         part = validate(found, [drawn.recording], noise, drawn.settings)
         low, high = part["expected_rms_error"]
@@ -66,7 +69,9 @@ def test_a_creeping_unit_has_the_floor_and_the_errors_of_one_that_stands_still()
 
 def test_the_rate_of_a_creeping_unit_is_no_error_of_its_gyroscope() -> None:
     drawn = draw(Hand(creep_dps=0.1), 7)
-    found = rests_and_moves.fit(with_noise([drawn.recording], drawn.settings), None, drawn.settings)
+    found = rests_and_moves.fit(
+        StageInput("gyroscope", with_noise([drawn.recording], drawn.settings), None, drawn.settings)
+    )
     assert found.covariance is not None
     error = np.concatenate([found.bias - drawn.bias["gyroscope"], (found.matrix - drawn.matrix["gyroscope"]).ravel()])
     assert np.mean(error**2 / np.diag(found.covariance)) < 2.2  # 12 parameters: 1.2 chance in 1000 beyond

@@ -17,6 +17,7 @@ from unit_settings import settings_of, with_noise
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import Recording
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
+from pipeline.estimation.stages import StageInput
 
 LOWER = [0, 1, 2, 3, 6, 7, 9, 10, 11]  # of bias and matrix
 KINDS = {"bias": [0, 1, 2], "scale factor": [3, 5, 8], "misalignment": [4, 6, 7]}  # of these nine
@@ -57,7 +58,7 @@ def coverage(kind: str, limit: float, units: int, seed: int) -> dict[str, Any]:
         K = np.diag(1 + 0.03 * rng.uniform(-1, 1, 3)) + limit * rng.uniform(-1, 1, (3, 3)) * (1 - np.eye(3))
         bias, M = 0.05 * rng.uniform(-1, 1, 3), np.linalg.inv(K)
         try:
-            found = fit(with_noise([recorded(up, K, bias, rng)], settings), None, settings)
+            found = fit(StageInput("accelerometer", with_noise([recorded(up, K, bias, rng)], settings), None, settings))
         except NotObservableError:
             continue
         L = np.linalg.cholesky((M.T @ M)[::-1, ::-1])[::-1, ::-1].T  # L^T L = M^T M

@@ -31,6 +31,7 @@ from pipeline.estimation.effects import model_of
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.multi_position.selection import SelectionByHand
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.stages import StageInput
 from pipeline.ingest.read import read_recordings
 from pipeline.simulation.description import shipped_settings
 from tests.published import validate
@@ -65,7 +66,8 @@ def judged(drawn: Drawn) -> dict[str, Any]:
     for sensor, method in FITS.items():
         if drawn.recording.reading(sensor) is None:
             continue
-        calibration = method.fit(with_noise([drawn.recording], drawn.settings), None, drawn.settings)
+        task = StageInput(sensor, with_noise([drawn.recording], drawn.settings), None, drawn.settings)
+        calibration = method.fit(task)
         assert calibration.covariance is not None
         assert calibration.freedom is not None
         u = np.sqrt(np.diag(calibration.covariance))[:12]
@@ -146,7 +148,7 @@ def named(which: str, seed: int, rest_s: float | None = None) -> bool:
     drawn = draw(Hand(rests=20, rest_s=rest_s or length, effects={which: size * signs}), 30_000 + seed)
     settings = settings_of(drawn.settings, procedure={"holdout_every": 0})
     noise = estimate_noise(sensor, [drawn.recording], settings.sensor.of(sensor))
-    calibration = FITS[sensor].fit(with_noise([drawn.recording], settings), None, settings)
+    calibration = FITS[sensor].fit(StageInput(sensor, with_noise([drawn.recording], settings), None, settings))
     model = model_of([drawn.recording], calibration, noise, settings)
     assert model is not None
     return effect in SelectionByHand(model, calibration, [], noise, settings.sensor.of(sensor)).names
@@ -174,6 +176,8 @@ def test_units_of_one_log_are_calibrated_by_their_own_columns(tmp_path: Path) ->
 
 def test_the_cosine_is_zero_under_the_weights_of_the_fit() -> None:
     drawn = draw(Hand(settle_deg=0.3, creep_dps=0.1), 1)
-    found = rests_and_moves.fit(with_noise([drawn.recording], drawn.settings), None, drawn.settings)
+    found = rests_and_moves.fit(
+        StageInput("gyroscope", with_noise([drawn.recording], drawn.settings), None, drawn.settings)
+    )
     assert found.convergence is not None
     assert found.convergence.cosine < found.convergence.cosine_at_minimum < 1e-3  # other weights give 1.5e-3

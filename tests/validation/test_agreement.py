@@ -13,6 +13,7 @@ from unit_settings import settings_of, with_noise
 from pipeline.core.records import Recording, SensorCalibration
 from pipeline.estimation import effects, reference_least_squares
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.stages import StageInput
 from pipeline.evaluation.diagnosis.verdict import DISAGREES
 from pipeline.evaluation.held_out.validation import validate
 from pipeline.simulation.campaign import simulate_unit
@@ -38,8 +39,8 @@ def held_out(sensor: str, change: np.ndarray, configured: tuple[str, ...] = (), 
     ]
     settings = settings_of(SETTINGS, effects={sensor: list(configured)})
     noise = estimate_noise(sensor, recordings, settings.sensor.of(sensor))
-    found = reference_least_squares.fit(sensor, with_noise(recordings, settings), None, settings)
-    found = effects.fit(sensor, with_noise(recordings, settings), found, settings) if configured else found
+    found = reference_least_squares.fit(StageInput(sensor, with_noise(recordings, settings), None, settings))
+    found = effects.fit(StageInput(sensor, with_noise(recordings, settings), found, settings)) if configured else found
     return validate(found, recordings, noise, settings), (found, recordings, noise, settings)
 
 
@@ -76,7 +77,7 @@ def test_held_out_motion_that_does_not_move_says_nothing_of_the_matrix() -> None
     attitude = np.tile([1.0, 0.0, 0.0, 0.0], (still.samples, 1))
     held = replace(still, name="validation", role="validation", table_attitude=attitude, table_rate=attitude[:, 1])
     noise = estimate_noise("gyroscope", recordings, SETTINGS.sensor.gyroscope)
-    found = reference_least_squares.fit("gyroscope", with_noise(recordings, SETTINGS), None, SETTINGS)
+    found = reference_least_squares.fit(StageInput("gyroscope", with_noise(recordings, SETTINGS), None, SETTINGS))
     assert validate(found, [*recordings, held], noise, SETTINGS).agreement is None
 
 

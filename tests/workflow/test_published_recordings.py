@@ -14,6 +14,7 @@ from whole_run import run_campaign
 from pipeline.app.config.campaign import load_campaign
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.stages import StageInput
 from pipeline.ingest.read import read_recordings
 from tests.published import validate
 
@@ -162,7 +163,7 @@ def test_ten_rests_without_a_recording_for_validation_calibrate_both_sensors() -
     config = campaign.units["mpu6050"].config
     recordings = read_recordings(config.procedure, config.ingest, config.sensor, campaign.folder("mpu6050"))
     alone = [r for r in recordings if r.role != "validation"]
-    found = rests_and_moves.fit(with_noise(alone, config), None, config)
+    found = rests_and_moves.fit(StageInput("gyroscope", with_noise(alone, config), None, config))
     assert found.stages[-1].details.rests == 10
     assert np.abs(np.diag(found.matrix) / AUTHORS["gyroscope"] - 1)[1:].max() < 9e-4
     part = validate(found, alone, estimate_noise("gyroscope", alone, config.sensor.gyroscope), config)

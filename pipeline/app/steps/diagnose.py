@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from pipeline.app.steps.unit_files import StoredUnit
 from pipeline.core.errors import omission
 from pipeline.core.records import SCHEMA_VERSION, SensorDiagnosis, Validation, calibrated
+from pipeline.estimation.known_effects import without_known_effects
 from pipeline.estimation.noise import required_noises
-from pipeline.estimation.stages import without_known_effects
 from pipeline.evaluation.diagnosis.diagnose import diagnose, effective_noise, without_diagnosis
 
 if TYPE_CHECKING:

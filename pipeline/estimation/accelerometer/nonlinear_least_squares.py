@@ -64,9 +64,8 @@ from pipeline.estimation.multi_position.result import (
     require_faces,
     with_stage,
 )
-from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import Orientations, orientations_of, rest_uses, sound_samples
-from pipeline.estimation.stages import FitStage
+from pipeline.estimation.stages import FitStage, StageInput
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_turns, used_motions
 from pipeline.estimation.uncertainty_budget import (
@@ -81,7 +80,6 @@ from pipeline.physics.kinematics import table_motion
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.core.records import UnitRecordings
     from pipeline.core.settings import DataSheet, Settings
 
 
@@ -159,16 +157,16 @@ class _Solved:
         return float(np.sqrt(high))
 
 
-def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings) -> SensorCalibration:
+def fit(task: StageInput) -> SensorCalibration:
     """Fit bias, scale factors and misalignment of the accelerometer (``pipeline.estimation.stages``).
 
     The recordings are rests in many orientations (role ``rests``), or a table's turns (role ``accelerometer``). Where
     the procedure states faces, the full matrix is fitted (``pipeline.estimation.multi_position.result``).
     """
-    if not settings.procedure.faces:
-        return _fit_triangular(recordings, previous, settings)
-    require_faces(recordings.filtered, settings.procedure)
-    return fit_faces(_fit_triangular(recordings, previous, settings), recordings, settings)
+    if not task.settings.procedure.faces:
+        return _fit_triangular(task)
+    require_faces(task.recordings.filtered, task.settings.procedure)
+    return fit_faces(_fit_triangular(task), task.recordings, task.settings)
 
 
 def triangle(values: Values) -> Values:
@@ -178,12 +176,9 @@ def triangle(values: Values) -> Values:
     return L
 
 
-def _fit_triangular(
-    recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
-) -> SensorCalibration:
-    data_sheet, gravity_g = settings.sensor.accelerometer, settings.table.gravity_g
-    prior = wander_prior(recordings.noises["accelerometer"], data_sheet)
-    rows = orientations_of(recordings.filtered, settings)
+def _fit_triangular(task: StageInput) -> SensorCalibration:
+    settings, data_sheet, prior, gravity_g = task.settings, task.data_sheet, task.prior, task.settings.table.gravity_g
+    rows = orientations_of(task.recordings.filtered, settings)
     if settings.procedure.sheet is None:
         limit = limit_of_misalignment(data_sheet)
         determined = partial(_fit_determined, gravity_g=gravity_g, prior=prior, limit=limit)
@@ -193,7 +188,7 @@ def _fit_triangular(
     while refused := _outlier(rows, solved):
         rows = _without(rows, refused)
         solved = determined(rows)
-    fitted, before = solved.fit, SensorCalibration("accelerometer", stages=previous.stages if previous else ())
+    fitted, before = solved.fit, SensorCalibration("accelerometer", stages=task.stages)
     if not rows.by_hand and solved.spare > 1:
         return _on_table(rows, solved, before, prior, settings)
     covariance = PLACED @ fitted.covariance @ PLACED.T

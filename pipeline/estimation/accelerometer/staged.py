@@ -56,8 +56,7 @@ from pipeline.estimation.accelerometer.turn_extremes import (
     turns_of,
 )
 from pipeline.estimation.engine import LinearMap, ResidualNoise
-from pipeline.estimation.noise import wander_prior
-from pipeline.estimation.stages import FitStage, staged_result
+from pipeline.estimation.stages import FitStage, StageInput, staged_result
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import noise_of_turns, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import (
@@ -74,7 +73,6 @@ if TYPE_CHECKING:
 
     Quantities = dict[str, tuple[float, str]]  # value and unit of each parameter
     Outcome = tuple[list[CorrectionStep], Quantities]  # steps of the correction by a stage, and its parameters
-    from pipeline.core.records import UnitRecordings
     from pipeline.core.settings import Settings
 
 REPLICATES = 60  # synthetic turns: their covariance is known to a tenth
@@ -284,14 +282,12 @@ class Estimator:
         return follow(extremes_of_sinusoids(coefficients, self.gravity_g), names, start)
 
 
-def fit(
-    name: str, recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
-) -> SensorCalibration:
+def fit(task: StageInput) -> SensorCalibration:
     """Run one stage of the staged method (``pipeline.estimation.stages``); role ``accelerometer``, on a table."""
-    before = [stage.name for stage in previous.stages] if previous else []
+    name, recordings, previous, settings = task.stage, task.recordings, task.previous, task.settings
+    prior, before = task.prior, [stage.name for stage in task.stages]
     estimator = Estimator.of(recordings.filtered, settings)
     turns, gravity_g, sinusoids = estimator.turns, estimator.gravity_g, estimator.sinusoids
-    prior = wander_prior(recordings.noises["accelerometer"], settings.sensor.accelerometer)
     theta = np.concatenate([s.coefficients for channel in range(3) for s in (turn[channel] for turn in sinusoids)])
 
     def chain(values: Values) -> Values:
@@ -322,7 +318,7 @@ def fit(
         sensor="accelerometer",
         bias=found.bias,
         matrix=np.diag(1.0 / found.k),
-        stages=(*(previous.stages if previous else ()), result),
+        stages=(*task.stages, result),
         effects=(FittedEffect(ASYMMETRY, asymmetry),) if last else (),
         convergence=convergence_of_sinusoids(sinusoids),
     )

@@ -57,9 +57,8 @@ from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative, lin
 from pipeline.estimation.gyroscope.known_turns import covariances, known_turns, with_budget
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.multi_position.moves import trapezoids
-from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.reference_least_squares import of_channels
-from pipeline.estimation.stages import FitStage
+from pipeline.estimation.stages import FitStage, StageInput
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
@@ -112,11 +111,12 @@ def forward_of(recordings: Sequence[Recording], bias: Values, table: Table) -> F
     return Forward(turns, Y, U, columns, columns.solve(Y).T)
 
 
-def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings) -> SensorCalibration:
+def fit(task: StageInput) -> SensorCalibration:
     """Fit the matrix of the gyroscope to integrated turns (``pipeline.estimation.stages``).
 
     Role ``gyroscope``, on a table, after the stage ``bias``.
     """
+    recordings, previous, settings, prior = task.recordings, task.previous, task.settings, task.prior
     assert previous is not None  # noqa: S101  (it needs the bias: FIT_STAGES)
     if settings.procedure.sheet is not None:
         return _fit_of_sheet(recordings, previous, settings)
@@ -125,7 +125,6 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
     factors = factorise(A)
     residuals = turns.reading - previous.bias - turns.rate @ A.T
     design = np.column_stack([np.ones(len(turns.rate)), turns.rate])
-    prior = wander_prior(recordings.noises["gyroscope"], settings.sensor.gyroscope)
     fit, of_bias = _linear_map(turns, A, previous, as_printed=as_printed)
     reference = Reference("gyroscope", used_motions(turns.parts), A, settings.table)
     noise = noise_of_fit(turns.parts, reference, residuals, design, prior)

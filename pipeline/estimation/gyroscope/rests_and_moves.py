@@ -40,18 +40,17 @@ from pipeline.estimation.engine import ScaledColumns
 from pipeline.estimation.multi_position.fit import MIN_NEW_NORM_SHARE, with_limits
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, model_of
-from pipeline.estimation.multi_position.model import ONE, State, prior_hypotheses
+from pipeline.estimation.multi_position.model import State, prior_hypotheses
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
-from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of
-from pipeline.estimation.stages import FitStage
+from pipeline.estimation.stages import FitStage, StageInput, limits_of_base
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.core.records import Recording, UnitRecordings, Values
-    from pipeline.core.settings import DataSheet, Procedure, Settings
+    from pipeline.core.records import Recording, Values
+    from pipeline.core.settings import Procedure
     from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 
@@ -116,24 +115,19 @@ def _over_noise(model: GyroscopeModel, fitted: FitByHand) -> tuple[Values, Value
     return size / max(scale, 1e-12), np.linalg.norm(r, axis=1)
 
 
-def _limits(data_sheet: DataSheet) -> dict[str, float]:
-    """Return the standard uncertainty of each element of the matrix, uniform within the sensor file's limits."""
-    scale, cross = (limit / np.sqrt(3.0) for limit in (data_sheet.scale_factor, data_sheet.cross_axis))
-    return {name: float(scale if name in ONE else cross) for name in MATRIX_NAMES}
-
-
-def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings) -> SensorCalibration:
+def fit(task: StageInput) -> SensorCalibration:
     """Fit bias and matrix of the gyroscope (``pipeline.estimation.stages``).
 
     Role ``rests``, with the readings of the accelerometer, which is calibrated first. Raises ``CannotCalibrateError``
     also where moves and turns do not determine the matrix: the unit then keeps the calibration of its accelerometer.
     """
-    filtered, procedure, noise = recordings.filtered, settings.procedure, recordings.noises["gyroscope"]
+    recordings, settings, noise, data_sheet = task.recordings, task.settings, task.noise, task.data_sheet
+    filtered, procedure = recordings.filtered, settings.procedure
     _require_recordings(filtered, procedure)
     accelerometer = accelerometer_of(recordings, settings)
-    data_sheet, sheet = settings.sensor.gyroscope, procedure.sheet is not None
+    sheet = procedure.sheet is not None
     frame_deg = frame_error(accelerometer, settings)
-    limits = _limits(data_sheet) if sheet else {}
+    limits = dict(zip(MATRIX_NAMES, limits_of_base(data_sheet)[MATRIX].tolist(), strict=True)) if sheet else {}
     model = model_of(filtered, None, noise, procedure, accelerometer, known_by_limit=limits, frame_deg=frame_deg)
     advice = RECORDING_ADVICE + advice_on_held_out(filtered, procedure)
     if model is None or not (model.moves or model.turns or sheet):
@@ -142,7 +136,7 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
             f"the gyroscope's matrix needs at least {MIN_MOVES} moves between rests, without gaps or clipped "
             f"readings{clipped_moves(filtered, rests) if rests else ''}: {advice}"
         )
-    noises = prior_hypotheses(wander_prior(noise, data_sheet), float(np.mean(model.white)), model.kinds)
+    noises = prior_hypotheses(task.prior, float(np.mean(model.white)), model.kinds)
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
     fit_model = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
     of_frame = np.radians(frame_deg) ** 2 * (1.0 - np.eye(3)).ravel()
@@ -195,8 +189,9 @@ def fit(recordings: UnitRecordings, previous: SensorCalibration | None, settings
         angles = model.turns.described(fitted.state)
         details = replace(details, turns=angles, turn_axes=axes, departures=departures)
     stage = StageResult(NAME, correction=(Subtract(fitted.state.bias), Multiply(fitted.state.matrix)), details=details)
-    before = SensorCalibration("gyroscope", stages=previous.stages if previous else ())
-    return after_stage(before, stage, model, fitted, settings, other=accelerometer)
+    return after_stage(
+        SensorCalibration("gyroscope", stages=task.stages), stage, model, fitted, settings, other=accelerometer
+    )
 
 
 def _require_recordings(recordings: Sequence[Recording], procedure: Procedure) -> None:

@@ -43,8 +43,7 @@ from pipeline.core.records import (
     motion_at_rest,
 )
 from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative
-from pipeline.estimation.noise import wander_prior
-from pipeline.estimation.stages import FitStage, staged_result
+from pipeline.estimation.stages import FitStage, StageInput, staged_result
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
@@ -55,7 +54,6 @@ if TYPE_CHECKING:
 
     # step of the correction by a stage, and value and unit of each of its parameters
     Outcome = tuple[Subtract | Multiply, dict[str, tuple[float, str]]]
-    from pipeline.core.records import UnitRecordings
     from pipeline.core.settings import Settings
 
 # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
@@ -172,20 +170,18 @@ def estimates_of(recordings: Sequence[Recording], settings: Settings) -> Estimat
     return Estimates(samples, weights, theta, Response(theta[0], theta[1:], samples.speed, as_printed))
 
 
-def fit(
-    name: str, recordings: UnitRecordings, previous: SensorCalibration | None, settings: Settings
-) -> SensorCalibration:
+def fit(task: StageInput) -> SensorCalibration:
     """Run one stage of the staged method (``pipeline.estimation.stages``).
 
     Role ``gyroscope``, on a table; also role ``static`` if these recordings hold no rest.
     """
+    name, recordings, previous, settings = task.stage, task.recordings, task.previous, task.settings
     if settings.procedure.sheet is not None and name == "bias":
         from pipeline.estimation.gyroscope.known_turns import fit_bias  # noqa: PLC0415  (only for turns of a sheet)
 
         return fit_bias(recordings, settings)
-    before = [stage.name for stage in previous.stages] if previous else []
+    prior, before = task.prior, [stage.name for stage in task.stages]
     samples, weights, theta, response = estimates_of(recordings.filtered, settings)
-    prior = wander_prior(recordings.noises["gyroscope"], settings.sensor.gyroscope)
     design = np.column_stack([np.ones(len(samples.rate)), samples.rate[:, samples.speed > 0]])
     residuals = samples.reading - theta[0] - samples.rate @ theta[1:]
 
@@ -218,7 +214,7 @@ def fit(
         sensor="gyroscope",
         bias=offset,
         matrix=matrix,
-        stages=(*(previous.stages if previous else ()), result),
+        stages=(*task.stages, result),
         convergence=Convergence(0.0, condition, columns, columns, closed_form=True),
     )
 

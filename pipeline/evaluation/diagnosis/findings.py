@@ -19,9 +19,9 @@ from pipeline.core.records import Answer, Candidate, Estimate, SensorDiagnosis, 
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.design import OTHER_PREFIX, EffectColumns, placed
 from pipeline.estimation.gates import MIN_DELTA_BIC
+from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
-from pipeline.estimation.stages import known_effects
 from pipeline.evaluation.diagnosis.verdict import if_observable
 from pipeline.evaluation.diagnosis.words import experiment_of, listed, of_unknown, plain, to_distinguish
 from pipeline.physics.effects import catalogue, effect

@@ -44,7 +44,7 @@ from pipeline.estimation.multi_position.model import NoiseHypothesis
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import SelectionByHand, hysteresis_of, posterior
 from pipeline.estimation.noise import noise_of
-from pipeline.estimation.stages import is_given
+from pipeline.estimation.stages import StageInput, is_given
 from pipeline.evaluation.diagnosis import functional_forms as forms
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.evaluation.diagnosis.method_errors import given_differences
@@ -161,7 +161,7 @@ def _model_of_all_rests(case: DiagnosisInput) -> Model:
         noise = noise or noise_of("accelerometer", case.recordings, settings.sensor.accelerometer)
         recordings = UnitRecordings([*case.recordings], {"accelerometer": noise})
         try:
-            return nonlinear_least_squares.fit(recordings, None, settings)
+            return nonlinear_least_squares.fit(StageInput("accelerometer", recordings, None, settings))
         except PipelineError:
             return fitted
 

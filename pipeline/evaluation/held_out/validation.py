@@ -49,6 +49,7 @@ from pipeline.core.settings import Uncertainty
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.accelerometer.nonlinear_least_squares import PARAMETER_NAMES
 from pipeline.estimation.rest_means import count_of_rests
+from pipeline.estimation.stages import StageInput
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.evaluation.held_out.error_breakdown import (
     LinearizedSamples,
@@ -265,7 +266,7 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
     plain = settings.replaced(sensor=own, table=table, uncertainty=Uncertainty(monte_carlo=0))
     held_out_and_static = UnitRecordings([*calibrated, *at_rest], {sensor: case.noise})
     try:
-        fit = reference_least_squares.fit(sensor, held_out_and_static, None, plain)
+        fit = reference_least_squares.fit(StageInput(sensor, held_out_and_static, None, plain))
     except (CannotCalibrateError, NotObservableError):
         return None
     slopes /= sum(part.number for part in parts)

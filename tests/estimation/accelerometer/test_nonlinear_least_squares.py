@@ -23,6 +23,7 @@ from pipeline.estimation.multi_position.fit import SMALL_LAST_STEP
 from pipeline.estimation.multi_position.fit import fit as fit_model
 from pipeline.estimation.multi_position.model import State, prior_hypotheses
 from pipeline.estimation.rest_means import gathered, held_out_rests, rest_means
+from pipeline.estimation.stages import StageInput
 from pipeline.physics.signal.rests import Rest
 from pipeline.physics.statements import not_determined
 
@@ -140,7 +141,14 @@ def test_the_derivative_equals_central_differences() -> None:
 @pytest.mark.parametrize("gravity_g", [1.0, 0.9976])
 def test_nine_parameters_are_exact_without_noise(gravity_g: float) -> None:
     recording = _by_hand(_spread(24), np.random.default_rng(2), noise=0.0, gravity_g=gravity_g)
-    calibration = fit(with_noise([recording], _settings(gravity_g=gravity_g)), None, _settings(gravity_g=gravity_g))
+    calibration = fit(
+        StageInput(
+            "accelerometer",
+            with_noise([recording], _settings(gravity_g=gravity_g)),
+            None,
+            _settings(gravity_g=gravity_g),
+        )
+    )
     assert _vector(calibration) == pytest.approx(TRUTH, abs=1e-9)
     assert calibration.converged
 
@@ -151,7 +159,7 @@ def test_the_truth_lies_within_the_expanded_uncertainty_in_its_share_of_hand_hel
     inside = []
     for seed in range(25):
         recording = _by_hand(_spread(24), np.random.default_rng(seed), between=between)
-        calibration = fit(with_noise([recording], settings), None, settings)
+        calibration = fit(StageInput("accelerometer", with_noise([recording], settings), None, settings))
         factors = coverage_factor(calibration.freedom[FITTED])
         inside.append(np.abs(_vector(calibration) - TRUTH) < factors * _uncertainty(calibration))
     assert 0.90 < np.mean(inside) < 0.99
@@ -162,7 +170,9 @@ def test_the_truth_lies_within_the_expanded_uncertainty_in_its_share_of_table_tu
     inside, errors, claimed = [], [], []
     for seed in range(16):
         settings = _settings(holdout_every=3)
-        calibration = fit(with_noise(record(np.random.default_rng(seed)), settings), None, settings)
+        calibration = fit(
+            StageInput("accelerometer", with_noise(record(np.random.default_rng(seed)), settings), None, settings)
+        )
         factor = coverage_factor(calibration.degrees_of_freedom)
         error, uncertainty = _vector(calibration) - TRUTH, _uncertainty(calibration)
         inside.append(np.abs(error) < factor * uncertainty)
@@ -174,15 +184,30 @@ def test_the_truth_lies_within_the_expanded_uncertainty_in_its_share_of_table_tu
 
 def test_dwells_are_averaged_in_stop_and_go_and_samples_are_taken_singly_in_a_turn() -> None:
     rng = np.random.default_rng(3)
-    stop = fit(with_noise(_stop_and_go(rng), _settings()), None, _settings()).stages[-1].details
-    turn = fit(with_noise(_continuous(rng), _settings()), None, _settings()).stages[-1].details
+    stop = (
+        fit(StageInput("accelerometer", with_noise(_stop_and_go(rng), _settings()), None, _settings()))
+        .stages[-1]
+        .details
+    )
+    turn = (
+        fit(StageInput("accelerometer", with_noise(_continuous(rng), _settings()), None, _settings()))
+        .stages[-1]
+        .details
+    )
     assert stop.orientations_used == 3 * 73
     assert turn.orientations_used == turn.samples_used == 3000
     assert stop.white_noise == pytest.approx(4e-3, rel=0.05)
 
 
 def test_the_matrix_is_lower_triangular_and_its_upper_triangle_has_no_uncertainty() -> None:
-    calibration = fit(with_noise([_by_hand(_spread(24), np.random.default_rng(4))], _settings()), None, _settings())
+    calibration = fit(
+        StageInput(
+            "accelerometer",
+            with_noise([_by_hand(_spread(24), np.random.default_rng(4))], _settings()),
+            None,
+            _settings(),
+        )
+    )
     assert calibration.covariance is not None
     for k in (4, 5, 8):
         assert calibration.matrix.ravel()[k - 3] == 0.0
@@ -190,7 +215,14 @@ def test_the_matrix_is_lower_triangular_and_its_upper_triangle_has_no_uncertaint
 
 
 def test_scale_factors_and_misalignment_make_up_the_matrix() -> None:
-    calibration = fit(with_noise([_by_hand(_spread(24), np.random.default_rng(5))], _settings()), None, _settings())
+    calibration = fit(
+        StageInput(
+            "accelerometer",
+            with_noise([_by_hand(_spread(24), np.random.default_rng(5))], _settings()),
+            None,
+            _settings(),
+        )
+    )
     found = {name: p.value for name, p in calibration.stages[-1].parameters.items()}
     S = np.diag([found[f"scale_factor_{axis}"] for axis in "xyz"])
     T = np.eye(3)
@@ -202,7 +234,14 @@ def test_the_uncertainty_of_a_misalignment_is_the_scatter_of_its_repeats() -> No
     values, claimed = [], []
     for seed in range(60):
         parameters = (
-            fit(with_noise([_by_hand(_spread(24), np.random.default_rng(seed))], _settings()), None, _settings())
+            fit(
+                StageInput(
+                    "accelerometer",
+                    with_noise([_by_hand(_spread(24), np.random.default_rng(seed))], _settings()),
+                    None,
+                    _settings(),
+                )
+            )
             .stages[-1]
             .parameters
         )
@@ -213,7 +252,7 @@ def test_the_uncertainty_of_a_misalignment_is_the_scatter_of_its_repeats() -> No
 
 def test_the_correction_is_the_calibration() -> None:
     recording = _by_hand(_spread(24), np.random.default_rng(6))
-    calibration = fit(with_noise([recording], _settings()), None, _settings())
+    calibration = fit(StageInput("accelerometer", with_noise([recording], _settings()), None, _settings()))
     assert recording.accelerometer is not None
     expected = (recording.accelerometer - calibration.bias) @ calibration.matrix.T
     assert corrected(calibration.stages[-1].correction, recording.accelerometer) == pytest.approx(expected)
@@ -221,7 +260,14 @@ def test_the_correction_is_the_calibration() -> None:
 
 def test_earlier_stages_are_kept_and_the_result_survives_its_file() -> None:
     before = SensorCalibration("accelerometer", stages=(StageResult("before", {}),))
-    calibration = fit(with_noise([_by_hand(_spread(24), np.random.default_rng(7))], _settings(3)), before, _settings(3))
+    calibration = fit(
+        StageInput(
+            "accelerometer",
+            with_noise([_by_hand(_spread(24), np.random.default_rng(7))], _settings(3)),
+            before,
+            _settings(3),
+        )
+    )
     assert [stage.name for stage in calibration.stages] == ["before", "nonlinear_least_squares"]
     again = SensorCalibration.from_json("accelerometer", json.loads(json.dumps(calibration.to_json())))
     assert again.to_json() == calibration.to_json()
@@ -246,7 +292,7 @@ def test_a_rest_that_contradicts_the_others_is_left_out_with_its_reason() -> Non
     recording = _by_hand(_spread(24), np.random.default_rng(9), noise=5e-4)
     assert recording.accelerometer is not None
     recording.accelerometer[325 * 10 : 325 * 10 + 250] *= 1.01
-    calibration = fit(with_noise([recording], _settings()), None, _settings())
+    calibration = fit(StageInput("accelerometer", with_noise([recording], _settings()), None, _settings()))
     left_out = calibration.stages[-1].details.rests_left_out
     assert [round(rest.time_s / 6.5) for rest in left_out] == [10]
     assert "mg off the length by the other rests" in left_out[0].reason
@@ -267,7 +313,11 @@ def test_a_rest_is_left_out_only_beyond_what_the_largest_of_all_reaches_by_chanc
     low, high = 1.0, 1.02
     for _ in range(9):
         middle = 0.5 * (low + high)
-        gone = fit(with_noise([stretched(middle)], _settings()), None, _settings()).stages[-1].details.rests_left_out
+        gone = (
+            fit(StageInput("accelerometer", with_noise([stretched(middle)], _settings()), None, _settings()))
+            .stages[-1]
+            .details.rests_left_out
+        )
         low, high = (low, middle) if gone else (middle, high)
     force = stretched(high).accelerometer
     assert force is not None
@@ -288,7 +338,9 @@ def test_a_rest_that_turned_is_left_out_with_its_reason() -> None:
     recording = _by_hand(_spread(24), np.random.default_rng(10), noise=5e-4)
     assert recording.accelerometer is not None
     recording.accelerometer[325 * 4 : 325 * 4 + 250, 0] += np.linspace(-0.05, 0.05, 250)
-    details = fit(with_noise([recording], _settings()), None, _settings()).stages[-1].details
+    details = (
+        fit(StageInput("accelerometer", with_noise([recording], _settings()), None, _settings())).stages[-1].details
+    )
     assert [round(rest.time_s / 6.5) for rest in details.rests_left_out] == [4]
     assert "direction of the specific force moves" in details.rests_left_out[0].reason
     assert details.orientations_used == 23
@@ -296,12 +348,14 @@ def test_a_rest_that_turned_is_left_out_with_its_reason() -> None:
 
 def test_held_out_rests_are_in_no_fit() -> None:
     recording = _by_hand(_spread(24), np.random.default_rng(11))
-    first = fit(with_noise([recording], _settings(3)), None, _settings(3))
+    first = fit(StageInput("accelerometer", with_noise([recording], _settings(3)), None, _settings(3)))
     assert first.stages[-1].details.orientations_used == 16
     assert recording.accelerometer is not None
     for rest in held_out_rests([recording], _settings(3).procedure)["recording"]:
         recording.accelerometer[rest.start : rest.stop] *= 1.001
-    assert fit(with_noise([recording], _settings(3)), None, _settings(3)).bias == pytest.approx(first.bias, abs=1e-12)
+    assert fit(
+        StageInput("accelerometer", with_noise([recording], _settings(3)), None, _settings(3))
+    ).bias == pytest.approx(first.bias, abs=1e-12)
 
 
 U_OF_LIMIT = 0.02 * np.sqrt(2.0 / 3.0)  # of the sum of two cross-axis terms, both uniform within 0.02
@@ -309,7 +363,11 @@ U_OF_LIMIT = 0.02 * np.sqrt(2.0 / 3.0)  # of the sum of two cross-axis terms, bo
 
 def test_six_positions_give_bias_and_scale_factors_and_the_limit_of_each_misalignment() -> None:
     faces = np.concatenate([np.eye(3), -np.eye(3)])
-    calibration = fit(with_noise([_by_hand(faces, np.random.default_rng(12))], _settings()), None, _settings())
+    calibration = fit(
+        StageInput(
+            "accelerometer", with_noise([_by_hand(faces, np.random.default_rng(12))], _settings()), None, _settings()
+        )
+    )
     stage, part = calibration.stages[-1], calibration.to_json()
     names = ["misalignment_yx", "misalignment_zx", "misalignment_zy"]
     assert stage.details.known_by_limit == pytest.approx(dict.fromkeys(names, U_OF_LIMIT))
@@ -330,10 +388,17 @@ def test_one_misalignment_alone_may_be_left_undetermined() -> None:
     o, s, c = np.zeros(8), np.sin(angle), np.cos(angle)
     turns = np.concatenate([np.column_stack([o, s, c]), np.column_stack([s, o, c]), [[1, 0, 0], [0, 1, 0]]])
     recording = _by_hand(turns, np.random.default_rng(13), noise=1e-3)
-    calibration = fit(with_noise([recording], _settings()), None, _settings())
+    calibration = fit(StageInput("accelerometer", with_noise([recording], _settings()), None, _settings()))
     assert list(calibration.stages[-1].details.known_by_limit) == ["misalignment_yx"]
     assert calibration.convergence.rank == 8
-    known = fit(with_noise([_by_hand(_spread(24), np.random.default_rng(13))], _settings()), None, _settings())
+    known = fit(
+        StageInput(
+            "accelerometer",
+            with_noise([_by_hand(_spread(24), np.random.default_rng(13))], _settings()),
+            None,
+            _settings(),
+        )
+    )
     assert known.convergence.rank == 9
     assert not_determined(known.to_json()) == ""
 
@@ -351,7 +416,7 @@ def test_misalignments_within_the_limit_are_covered_where_few_rests_do_not_deter
         inverse = np.linalg.inv(K)
         L = np.linalg.cholesky((inverse.T @ inverse)[::-1, ::-1])[::-1, ::-1].T
         recording = _by_hand(up @ K.T @ MATRIX.T, rng, noise=2e-3)  # its readings are those of the matrix MATRIX
-        calibration = fit(with_noise([recording], _settings()), None, _settings())
+        calibration = fit(StageInput("accelerometer", with_noise([recording], _settings()), None, _settings()))
         limited += bool(calibration.stages[-1].details.known_by_limit)
         truth = np.concatenate([BIAS, L.ravel()])[FITTED]
         U = np.array(calibration.to_json()["uncertainty_budget"]["expanded_uncertainty"])[FITTED]
@@ -363,7 +428,7 @@ def test_misalignments_within_the_limit_are_covered_where_few_rests_do_not_deter
 def test_too_few_orientations_are_refused_with_their_number() -> None:
     recording = _by_hand(_spread(5), np.random.default_rng(14))
     with pytest.raises(NotObservableError, match=r"5 orientations determine neither.*at least 6 orientations"):
-        fit(with_noise([recording], _settings()), None, _settings())
+        fit(StageInput("accelerometer", with_noise([recording], _settings()), None, _settings()))
 
 
 def test_orientations_that_are_too_much_alike_are_refused_and_the_parameters_named() -> None:
@@ -373,20 +438,24 @@ def test_orientations_that_are_too_much_alike_are_refused_and_the_parameters_nam
     assert recording.accelerometer is not None
     recording.accelerometer[:, 2] = BIAS[2]
     with pytest.raises(NotObservableError, match=r"12 orientations are too much alike.*bias_z, .*scale_factor_z"):
-        fit(with_noise([recording], _settings()), None, _settings())
+        fit(StageInput("accelerometer", with_noise([recording], _settings()), None, _settings()))
 
 
 def test_a_unit_without_rests_cannot_be_calibrated_and_says_what_would_do() -> None:
     gyroscope = Recording("gyro_x", "gyroscope", "x", np.arange(5), gyroscope=np.zeros((5, 3)))
     with pytest.raises(CannotCalibrateError, match="record some 24 rests"):
-        fit(with_noise([gyroscope], _settings()), None, _settings())
+        fit(StageInput("accelerometer", with_noise([gyroscope], _settings()), None, _settings()))
 
 
 @needs_data
 def test_a_published_recording_gives_the_factory_certificate() -> None:
     recording = _xsens()
     begin = clock.process_time()
-    calibration = fit(with_noise([recording], _settings(gravity_g=PADUA_G)), None, _settings(gravity_g=PADUA_G))
+    calibration = fit(
+        StageInput(
+            "accelerometer", with_noise([recording], _settings(gravity_g=PADUA_G)), None, _settings(gravity_g=PADUA_G)
+        )
+    )
     assert clock.process_time() - begin < 1.0
     stage = calibration.stages[-1]
     assert stage.details.orientations_used == 38
@@ -401,7 +470,7 @@ def test_a_published_recording_gives_the_factory_certificate() -> None:
 @needs_data
 def test_a_fit_to_two_thirds_of_a_published_recording_predicts_the_rest() -> None:
     recording, settings = _xsens(), _settings(3, PADUA_G)
-    calibration = fit(with_noise([recording], settings), None, settings)
+    calibration = fit(StageInput("accelerometer", with_noise([recording], settings), None, settings))
     means, _ = rest_means(recording, held_out_rests([recording], settings.procedure)["recording"])
     assert len(means) == 13
     error = np.linalg.norm((means - calibration.bias) @ calibration.matrix.T, axis=1) - PADUA_G
@@ -419,7 +488,7 @@ def test_a_published_mpu6050_recording_agrees_with_its_authors() -> None:
         accelerometer=counts[:, :3] / 16384.0,
         gyroscope=counts[:, 3:] / 131.0,
     )
-    calibration = fit(with_noise([recording], _settings()), None, _settings())
+    calibration = fit(StageInput("accelerometer", with_noise([recording], _settings()), None, _settings()))
     assert calibration.stages[-1].details.orientations_used == 10
     # Theirs are no better than that: two of their ten intervals reach into a move.
     assert calibration.bias * 16384.0 == pytest.approx([711.5, -358.5, -1840.1], abs=30.0)

@@ -12,7 +12,7 @@ from pipeline.core.errors import CannotCalibrateError, ConfigurationError, NotOb
 from pipeline.core.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
 from pipeline.core.records.calibration import corrected
 from pipeline.estimation.gyroscope.cholesky_lu import factorise, fit
-from pipeline.estimation.stages import fit_stage
+from pipeline.estimation.stages import StageInput, fit_stage
 
 if TYPE_CHECKING:
     from pipeline.core.settings import Settings
@@ -80,7 +80,7 @@ def _campaign(
 
 def _fit(recordings: list[Recording], settings: Settings = SETTINGS) -> SensorCalibration:
     unit = with_noise(recordings, settings)
-    return fit(unit, fit_stage("gyroscope", "bias", unit, None, settings), settings)
+    return fit(StageInput("gyroscope", unit, fit_stage("gyroscope", "bias", unit, None, settings), settings))
 
 
 def _values(calibration: SensorCalibration) -> dict[str, float]:
@@ -190,7 +190,7 @@ def test_a_delay_of_the_readings_hardly_matters_to_integrated_turns() -> None:
         late = np.concatenate([reading[:2], reading[:-2]])  # 0.24 s: 5 deg at 20 deg/s
         delayed.append(dataclasses.replace(recording, gyroscope=late, filter={"name": "rc_low_pass", "delay_s": 0.24}))
     unit = UnitRecordings(delayed, {"gyroscope": None})
-    found = fit(unit, fit_stage("gyroscope", "bias", unit, None, SETTINGS), SETTINGS)
+    found = fit(StageInput("gyroscope", unit, fit_stage("gyroscope", "bias", unit, None, SETTINGS), SETTINGS))
     assert found.matrix @ FORWARD == pytest.approx(np.eye(3), abs=1e-9)
 
 
@@ -254,9 +254,9 @@ def test_without_a_rest_the_bias_of_a_static_recording_counts_with_its_uncertain
     static = Recording("static", "static", None, (9000 + np.arange(2000)) * 120_000_000, gyroscope=reading)
     before = fit_stage("gyroscope", "bias", with_noise([*turning, static], SETTINGS), None, SETTINGS)
     assert before.covariance is not None
-    known = fit(with_noise([*turning, static], SETTINGS), before, SETTINGS)
+    known = fit(StageInput("gyroscope", with_noise([*turning, static], SETTINGS), before, SETTINGS))
     unknown = dataclasses.replace(before, covariance=1e4 * before.covariance)
-    vague = fit(with_noise([*turning, static], SETTINGS), unknown, SETTINGS)
+    vague = fit(StageInput("gyroscope", with_noise([*turning, static], SETTINGS), unknown, SETTINGS))
     assert known.covariance is not None
     assert vague.covariance is not None
     assert vague.covariance[3, 3] > 10.0 * known.covariance[3, 3]
@@ -284,7 +284,7 @@ def test_without_a_table_log_the_gyroscope_cannot_be_calibrated_and_the_recordin
     bare = [dataclasses.replace(r, table_angle=None, table_rate=None) for r in _campaign()]
     before = SensorCalibration("gyroscope", bias=BIAS)
     with pytest.raises(CannotCalibrateError, match=r"Cholesky and LU method needs the table's motion.*record turns"):
-        fit(with_noise(bare, SETTINGS), before, SETTINGS)
+        fit(StageInput("gyroscope", with_noise(bare, SETTINGS), before, SETTINGS))
 
 
 def test_without_the_bias_stage_it_is_refused() -> None:

@@ -17,6 +17,7 @@ from pipeline.estimation.multi_position.accelerometer import model_of
 from pipeline.estimation.multi_position.model import selection_hypotheses
 from pipeline.estimation.multi_position.selection import fit_configured, limits_of
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.stages import StageInput
 from tests.published import validate
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ CASES = [
 def fitted(unit: Unit, wanted: Any, before: SensorCalibration | None = None) -> SensorCalibration:
     before = before or unit.calibrated("accelerometer")
     settings = settings_of(unit.settings, effects={"accelerometer": wanted})
-    return fit_effects("accelerometer", with_noise(unit.recordings, settings), before, settings)
+    return fit_effects(StageInput("accelerometer", with_noise(unit.recordings, settings), before, settings))
 
 
 def deviations(unit: Unit, found: SensorCalibration) -> np.ndarray:

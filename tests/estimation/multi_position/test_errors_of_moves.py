@@ -11,6 +11,7 @@ from hand_simulator import Drawn, Hand, draw
 from unit_settings import with_noise
 
 from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.estimation.stages import StageInput
 from pipeline.physics.signal.rests import find_rests
 
 if TYPE_CHECKING:
@@ -38,7 +39,10 @@ def knocked(drawn: Drawn, moves: list[int]) -> tuple[Drawn, list[float]]:
 def test_moves_far_off_the_others_are_told_and_take_no_part() -> None:
     drawn = draw(Hand(), 21)
     off, begin = knocked(drawn, [8, 20])  # every third rest from the second is held out, with the move before it
-    sound, found = (rests_and_moves.fit(with_noise([d.recording], d.settings), None, d.settings) for d in (drawn, off))
+    sound, found = (
+        rests_and_moves.fit(StageInput("gyroscope", with_noise([d.recording], d.settings), None, d.settings))
+        for d in (drawn, off)
+    )
     assert sound.stages[-1].details.moves_outlying == []
     told = found.stages[-1].details.moves_outlying
     assert [move.time_s for move in told] == pytest.approx(begin, abs=0.02)
@@ -53,7 +57,9 @@ def test_moves_far_off_the_others_are_told_and_take_no_part() -> None:
 def test_errors_that_neighbouring_moves_share_are_in_the_uncertainty() -> None:
     """The direction of gravity at each rest is off by 0.3 deg: taken for independent, the ratio is 1.4 (n = 40)."""
     ratio = [
-        squared_errors(rests_and_moves.fit(with_noise([d.recording], d.settings), None, d.settings), d).mean()
+        squared_errors(
+            rests_and_moves.fit(StageInput("gyroscope", with_noise([d.recording], d.settings), None, d.settings)), d
+        ).mean()
         for d in (draw(Hand(rests=30, settle_deg=0.3), seed) for seed in range(5))
     ]
     assert 0.3 < np.mean(ratio) < 1.7

@@ -21,6 +21,7 @@ from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.multi_position.gyroscope import model_of
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.moves import to_the_end
+from pipeline.estimation.stages import StageInput
 from pipeline.ingest.quality_flags import examine
 from pipeline.physics.effects import effect
 from pipeline.simulation.trajectory import rotation_about
@@ -93,7 +94,9 @@ def test_derivatives_of_the_moves_are_those_of_their_residuals() -> None:
 def test_an_effect_of_moves_is_fitted_with_the_matrix() -> None:
     unit = hand_held("mpu6050", 5, {"gyroscope.scale_factor_asymmetry": None}, interval_s=0.02)
     settings = settings_of(unit.settings, effects={"gyroscope": ["scale_factor_asymmetry"]})
-    found = fit_effects("gyroscope", with_noise(unit.recordings, settings), unit.calibrated("gyroscope"), settings)
+    found = fit_effects(
+        StageInput("gyroscope", with_noise(unit.recordings, settings), unit.calibrated("gyroscope"), settings)
+    )
     truth = np.array(list(unit.truth["gyroscope"]["effects"]["scale_factor_asymmetry"].values()))
     assert found.covariance is not None
     assert np.all(np.abs(found.effects[0].values - truth) < 4.0 * np.sqrt(np.diag(found.covariance))[12:])
@@ -104,19 +107,19 @@ def test_without_rests_by_hand_the_gyroscope_is_left_null_with_the_reason() -> N
     unit = hand_held("mpu6050", 6)
     turns: list[Recording] = [replace(r, role="gyroscope", axis="x") for r in unit.recordings]
     with pytest.raises(CannotCalibrateError, match="24 rests"):
-        rests_and_moves.fit(with_noise(turns, unit.settings), None, unit.settings)
+        rests_and_moves.fit(StageInput("gyroscope", with_noise(turns, unit.settings), None, unit.settings))
 
 
 def test_too_few_moves_are_refused() -> None:
     unit = hand_held("mpu6050", 6, procedure="six_positions", holdout_every=0)
     with pytest.raises(CannotCalibrateError, match="at least 6 moves") as refused:
-        rests_and_moves.fit(with_noise(unit.recordings, unit.settings), None, unit.settings)
+        rests_and_moves.fit(StageInput("gyroscope", with_noise(unit.recordings, unit.settings), None, unit.settings))
     assert "holdout_every" not in str(refused.value)
     unit = hand_held("mpu6050", 6, procedure="six_positions", holdout_every=3)
     with pytest.raises(
         CannotCalibrateError, match=r"2 are held out for validation \(procedure.holdout_every=0 uses them"
     ):
-        rests_and_moves.fit(with_noise(unit.recordings, unit.settings), None, unit.settings)
+        rests_and_moves.fit(StageInput("gyroscope", with_noise(unit.recordings, unit.settings), None, unit.settings))
     unit = hand_held("mpu6050", 6)
     few = [
         replace(r.select(slice(int(0.5 * r.samples), int(0.7 * r.samples))), role="rests")
@@ -126,7 +129,7 @@ def test_too_few_moves_are_refused() -> None:
     with pytest.raises(
         CannotCalibrateError, match=r"so 3 rests, .* are held out .* use them by procedure.holdout_every=0"
     ):
-        rests_and_moves.fit(with_noise(few, unit.settings), None, unit.settings)
+        rests_and_moves.fit(StageInput("gyroscope", with_noise(few, unit.settings), None, unit.settings))
 
 
 @pytest.mark.parametrize(("share", "left"), [(0.8, 14), (0.5, 0)])

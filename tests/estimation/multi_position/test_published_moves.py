@@ -14,6 +14,7 @@ from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.rest_means import split_rests
+from pipeline.estimation.stages import StageInput
 from pipeline.evaluation.held_out.attitude import gravity_direction
 from pipeline.ingest.read import read_recordings
 from pipeline.physics.measurement import compensate
@@ -44,11 +45,13 @@ def recordings() -> list[Recording]:
 
 @pytest.fixture(scope="module")
 def fitted(recordings: list[Recording]) -> dict[str, SensorCalibration]:
-    plain = rests_and_moves.fit(with_noise(recordings, SETTINGS), None, SETTINGS)
+    plain = rests_and_moves.fit(StageInput("gyroscope", with_noise(recordings, SETTINGS), None, SETTINGS))
     return {
-        "accelerometer": nonlinear_least_squares.fit(with_noise(recordings, SETTINGS), None, SETTINGS),
+        "accelerometer": nonlinear_least_squares.fit(
+            StageInput("accelerometer", with_noise(recordings, SETTINGS), None, SETTINGS)
+        ),
         "gyroscope": plain,
-        "with g": fit_effects("gyroscope", with_noise(recordings, SETTINGS), plain, SETTINGS),
+        "with g": fit_effects(StageInput("gyroscope", with_noise(recordings, SETTINGS), plain, SETTINGS)),
     }
 
 
@@ -126,7 +129,7 @@ def test_whole_turns_of_a_ferraris_session_are_360_degrees_to_a_hands_accuracy(t
     sheets = {name: {"full_scale": 2000.0} for name in ("accelerometer", "gyroscope")}
     settings = settings_of(SETTINGS, sensor=sheets, procedure={"holdout_every": 0})
     recordings = read_recordings(SETTINGS.procedure, ingest, settings.sensor, tmp_path)
-    found = rests_and_moves.fit(with_noise(recordings, settings), None, settings)
+    found = rests_and_moves.fit(StageInput("gyroscope", with_noise(recordings, settings), None, settings))
     assert recordings[0].gyroscope is not None
     calibrated = (recordings[0].gyroscope - found.bias) @ found.matrix.T / 102.4
     for axis, start, stop in ((0, 6728, 7141), (1, 8037, 8426), (2, 9161, 9559)):  # about x, y and z, between rests

@@ -17,6 +17,7 @@ from unit_settings import settings_of, with_noise
 from pipeline.core.settings import Window
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.estimation.stages import StageInput
 from pipeline.ingest.read import read_recordings
 from pipeline.physics.signal.segments import cut
 from pipeline.simulation.description import shipped_settings
@@ -118,7 +119,7 @@ def test_the_example_session_agrees_with_ferraris_1995(tmp_path: Path, sensor: s
     assert whole.accelerometer is not None
     assert whole.gyroscope is not None
     force, rate = ({n: v[a:b] for n, (a, b) in SECTIONS.items()} for v in (whole.accelerometer, whole.gyroscope))
-    found = FITS[sensor].fit(with_noise(recordings, settings), None, settings)
+    found = FITS[sensor].fit(StageInput(sensor, with_noise(recordings, settings), None, settings))
     assert np.abs(difference(found, ferraris(force, rate, RATE_HZ, -360.0)[sensor])).max() < 2.0
     if sensor == "gyroscope":
         turns = found.stages[-1].details.turns
@@ -140,7 +141,7 @@ def test_the_session_in_parts_agrees_with_the_published_calibration(tmp_path: Pa
         start, stop = float(own[0]) / 204.8, float(own[-1] + 1) / 204.8
         windows.append(Window.model_validate({"role": "rests", "axis": axis, "start_s": start, "stop_s": stop}))
     parts = cut(recordings[0], windows)
-    found = FITS[sensor].fit(with_noise(parts, settings), None, settings)
+    found = FITS[sensor].fit(StageInput(sensor, with_noise(parts, settings), None, settings))
     # K R of the published file is counts a m/s^2 or deg/s. Its turns are taken as -360 deg; the readings show +360.
     short, per_unit, sign = {"accelerometer": ("a", 9.81, 1.0), "gyroscope": ("g", 1.0, -1.0)}[sensor]
     scale = counts[0] if sensor == "accelerometer" else counts[1]
