@@ -18,6 +18,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import StageInput
 from pipeline.evaluation.diagnosis.words import in_words
+from pipeline.physics.effects import effect_from, forget, register
 from tests.published import diagnose, validate
 
 NAMED = [
@@ -216,3 +217,13 @@ def test_a_static_recording_of_another_switching_on_is_in_doubt(sensor: str, cha
     assert after["verdict"] == "reference_in_doubt"
     assert "times of switching on" in after["reason"]
     assert "in the session of the other recordings" in after["next_experiment"]
+
+
+def test_by_hand_a_formula_that_gravity_makes_constant_is_not_observable() -> None:
+    definition = {"name": "of_length", "owner": "sensor", "sensors": ["accelerometer", "gyroscope"], "meaning": "Mine.",
+                  "terms": {"c": {"formula": "fx * fx + fy * fy + fz * fz", "unit": "1"}}}  # fmt: skip
+    register(effect_from(definition, "of_length.yaml"))
+    unit = hand_held("mpu6050", 11, interval_s=0.02)
+    for sensor in ("accelerometer", "gyroscope"):
+        assert "bias and matrix explain all that it would add" in reasons(unit.diagnosed(sensor))["of_length"]
+    forget()

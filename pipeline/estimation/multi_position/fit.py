@@ -514,17 +514,20 @@ def plausible(model: Model, fitted: FitByHand, limits: Limits) -> bool:
     )
 
 
+def adds_nothing(Q: Values, columns: Values) -> bool:
+    """Return whether columns of an effect are combinations of those of bias and matrix, with orthonormal base Q."""
+    size, rest = np.linalg.norm(columns, axis=0), np.linalg.norm(columns - Q @ (Q.T @ columns), axis=0)
+    return bool(np.all(rest <= MIN_NEW_NORM_SHARE * np.where(size > 0.0, size, 1.0)))
+
+
 def require_observable(model: Model, fitted: FitByHand, limits: Limits) -> None:
     """Raise ``NotObservableError``, with the effects or parameters, if rests and moves do not determine them."""
     equations = fitted.equations
     limited = _prior(model, fitted.state, limits)[0] > 0.0
     names = parameter_names(model.sensor, [term.effect for term in fitted.state.terms])
     Q, _ = np.linalg.qr(equations.base)
-    lost = []
-    for term, Z in zip(fitted.state.terms, equations.effects, strict=True):
-        size, rest = np.linalg.norm(Z, axis=0), np.linalg.norm(Z - Q @ (Q.T @ Z), axis=0)
-        if np.all(rest <= MIN_NEW_NORM_SHARE * np.where(size > 0.0, size, 1.0)):
-            lost.append(term.effect)
+    shown = zip(fitted.state.terms, equations.effects, strict=True)
+    lost = [term.effect for term, Z in shown if adds_nothing(Q, Z)]
     scaled = equations.columns / np.maximum(np.linalg.norm(equations.columns, axis=0), 1e-300)
     weak = np.linalg.eigh(scaled.T @ scaled + np.diag(limited.astype(float)))
     undetermined = np.abs(weak.eigenvectors[:, weak.eigenvalues < UNDETERMINED_COLUMN_SHARE])[-len(names) :]

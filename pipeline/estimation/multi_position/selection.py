@@ -31,6 +31,7 @@ from pipeline.estimation.multi_position.fit import (
     MIN_NEW_NORM_SHARE,
     SMALL_LAST_STEP,
     FitByHand,
+    adds_nothing,
     fit,
     judged_curves,
     log_determinants,
@@ -178,10 +179,11 @@ class SelectionByHand:
         possible = np.flatnonzero(self.ceilings > fitted_model.log_likelihood - CEILING_TO)
         projected = project_out(equations, [self.hypotheses[i] for i in possible])
         before, at = projected.of_model()
+        Q, _ = np.linalg.qr(equations.base)
         out = CandidateScores()
         for j, term in enumerate(terms):
             name, count = term.effect.name, projected.count(j, at)
-            if count == 0:
+            if count == 0 or adds_nothing(Q, equations.candidates[j]):
                 continue
             added = count + len(term.effect.nonlinear)
             factor = projected.correction(j, at, added, equations.scatter)
