@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeVar
+from weakref import ref
 
 import numpy as np
 
@@ -34,8 +35,9 @@ from pipeline.physics.signal.filters import filtered, impulse_response
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+    from weakref import ReferenceType
 
-    from pipeline.core.records import Mask, Motion, Noise, Recording, Values
+    from pipeline.core.records import Mask, Motion, Noise, Quantities, Recording, Values
     from pipeline.core.settings import Table
 
 
@@ -68,7 +70,6 @@ class RecordingRows:
     rounding: Values | None = None  # (m,); variance of the rate by a coarse encoder, (deg/s)^2; None: a fine one
     # motion by names and values of effects of timing
     moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, repr=False)
-    observations: dict[Hashable, Observations] = field(default_factory=dict, repr=False)  # that begin with these rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,17 +85,15 @@ class Observations:
     levelling_deg: float = 0.0  # standard uncertainty of the table's level; 0: not stated
     white: float = 0.0  # standard deviation of a sample's white noise, mean of the axes; 0: not known
     steady: float = float("inf")  # s; time over which the bias is constant against white noise
-
-    @cached_property
-    def _results(self) -> dict[Hashable, Any]:
-        return {}
+    kept: ReferenceType[Quantities] | None = field(default=None, repr=False)  # results, with the first recording
 
     def once(self, key: Hashable, compute: Callable[[], Result]) -> Result:
-        """Return a result that steps and methods of a unit share; ``key``: all that it depends on beside these data."""
-        if key not in self._results:
-            self._results[key] = compute()
-        found: Result = self._results[key]
-        return found
+        """Return a result that steps and methods of a unit share; ``key``: all that it depends on beside these data.
+
+        It is kept with the recordings.
+        """
+        kept = None if self.kept is None else self.kept()
+        return compute() if kept is None else kept.once((self, key), compute)
 
     @cached_property
     def reading(self) -> Values:
@@ -245,8 +244,9 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Table) -> Obser
         mounting_in_doubt=doubt,
         angle_deg=table.angle_accuracy_deg if table.motion == "logged" else 0.0,
         levelling_deg=table.levelling_deg or 0.0,
+        kept=ref(recordings[0].results) if recordings else None,
     )
-    return found.parts[0].observations.setdefault((found.parts, table, doubt), found) if parts else found
+    return recordings[0].results.once((found.parts, table, doubt), lambda: found) if parts else found
 
 
 def _rows(recording: Recording, sensor: str, motion: Motion) -> RecordingRows | None:

@@ -46,6 +46,17 @@ MEDIAN_SIZE = 1.4826  # standard deviation over median absolute deviation of a n
 MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise with standard deviation 1: 0.67449 sqrt(2)
 
 
+class Quantities(dict["Hashable", Any]):
+    """What is computed once, by all that it depends on."""
+
+    def once(self, key: Hashable, compute: Callable[[], ReturnedQuantity]) -> ReturnedQuantity:
+        """Return what was computed at the first call with a key."""
+        if key not in self:
+            self[key] = compute()
+        found: ReturnedQuantity = self[key]
+        return found
+
+
 @dataclass(frozen=True)
 class Recording:
     """The samples of one recording.
@@ -95,18 +106,23 @@ class Recording:
         return float(median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
 
     @cached_property
-    def _quantities(self) -> dict[Hashable, Any]:
+    def _quantities(self) -> Quantities:
         """The quantities that are declared ``once``, by function and arguments."""
-        return {}
+        return Quantities()
 
     @cached_property
-    def _quantities_of_log(self) -> dict[Hashable, Any]:
+    def _quantities_of_log(self) -> Quantities:
         """Those that are declared ``once_of_log``."""
-        return {}
+        return Quantities()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what is copied to another process: not the quantities, which contain functions."""
         return {name: value for name, value in vars(self).items() if not name.startswith("_quantities")}
+
+    @property
+    def results(self) -> Quantities:
+        """What is kept with the log; of several recordings, with that of the first."""
+        return self._quantities_of_log
 
     def with_readings(self, **fields: Any) -> Self:  # noqa: ANN401  (of the dataclass)
         """Return the recording with other readings, flags, filter or role, and the same quantities of its log."""
@@ -178,15 +194,12 @@ def once_of_log(
 
 def _kept(
     compute: Callable[Concatenate[Recording, Arguments], ReturnedQuantity],
-    quantities: Callable[[Recording], dict[Hashable, Any]],
+    quantities: Callable[[Recording], Quantities],
 ) -> Callable[Concatenate[Recording, Arguments], ReturnedQuantity]:
     @wraps(compute)
     def quantity(recording: Recording, /, *arguments: Arguments.args, **named: Arguments.kwargs) -> ReturnedQuantity:
-        known, key = quantities(recording), (quantity, arguments, *sorted(named.items()))
-        if key not in known:
-            known[key] = quantity.__wrapped__(recording, *arguments, **named)
-        found: ReturnedQuantity = known[key]
-        return found
+        key = quantity, arguments, *sorted(named.items())
+        return quantities(recording).once(key, lambda: quantity.__wrapped__(recording, *arguments, **named))
 
     return quantity
 
