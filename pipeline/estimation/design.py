@@ -362,7 +362,7 @@ class Design:
         total = np.zeros((len(settings), count**2))
         of_axes = self._of_axes(lambda own: own.products(settings))
         for c, (products, _) in enumerate(of_axes):
-            total[:, self._to[c]] += products.reshape(len(settings), -1)[:, self._from[c]] / self.scale[c] ** 2
+            total[:, self._to[c]] += products.reshape(len(settings), -1).take(self._from[c], 1) / self.scale[c] ** 2
         square = total.reshape(-1, count, count)
         for at, term, prior in self._priors:  # as readings of the parameters themselves
             rest = prior.mean - term.values

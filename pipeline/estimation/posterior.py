@@ -408,7 +408,7 @@ def _products(
     The base is projected out of the other columns. The places are those of the listed terms. If the fit has no effects,
     the products are those of the selection's ranking. ``known``: number of columns of the base.
     """
-    ranking, walks = selection.ranking, [*random_walks(selection.settings).values()]
+    ranking = selection.ranking
     places = {
         (term.effect.name, term.values.tobytes()): at
         for term, at in zip(ranking.candidates, ranking.design.slices, strict=False)
@@ -417,14 +417,12 @@ def _products(
     if fit.terms or any(key not in places for key in keys):
         configured = fit.terms[: len(selection.base.terms)]
         design = design_at(selection.observations, fit, [*configured, *(term for _, term, _ in listed)])
+        walks = random_walks(selection.settings).values()
         stacked, logarithms = design.products([WHITE_SETTING, *selection.settings, *walks])
         projected = without(stacked, np.arange(known))[:, known:, known:]
         return design, stacked[:, :known, :known], projected, logarithms, design.slices[len(configured) :]
-    stacked, logarithms = ranking.design.products(walks)
-    projected = without(stacked, np.arange(known))[:, known:, known:]
-    base = np.concatenate([ranking.stacked[:, :known, :known], stacked[:, :known, :known]])
-    projected = np.concatenate([ranking.projected, projected])
-    return ranking.design, base, projected, np.append(ranking.logarithms, logarithms), [places[key] for key in keys]
+    base, projected = ranking.stacked[:, :known, :known], ranking.with_walks.copy()
+    return ranking.design, base, projected, ranking.logarithms, [places[key] for key in keys]
 
 
 def _problem(selection: Selection, fit: JointFit, candidates: Mapping[str, EffectColumns]) -> CandidateProblem:

@@ -17,7 +17,7 @@ import scipy
 
 from pipeline.core.records import BASE_COUNT, standard_uncertainty
 from pipeline.estimation.design import Design, EffectColumns, Start
-from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
+from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, random_walks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -81,11 +81,13 @@ class Ranking:
                 ]
         configured = [replace(fitted[term.effect.name], full=True) for term in base.terms]
         design = Design(observations, [*configured, *self.candidates], fit.K, fit.scale, project=True)
-        stacked, logarithms = design.products(self.settings)
-        self.design, self.stacked, self.logarithms = design, stacked, logarithms
-        self.penalty = 0.5 * logarithms - np.array([setting.prior for setting in self.settings])
+        walks = [] if fit.terms else random_walks(settings).values()  # for the posterior at the same fit
+        self.stacked, self.logarithms = design.products([*self.settings, *walks])
+        self.design, of_settings = design, slice(len(self.settings))
+        self.penalty = 0.5 * self.logarithms[of_settings] - np.array([setting.prior for setting in self.settings])
         known = BASE_COUNT + sum(s.stop - s.start for s in design.slices[: len(configured)])
-        self.projected = without(stacked, np.arange(known))[:, known:, known:]
+        self.with_walks = without(self.stacked, np.arange(known))[:, known:, known:]
+        self.projected = self.with_walks[of_settings]
         self.spans = [slice(s.start - known, s.stop - known) for s in design.slices[len(configured) :]]
         size = np.where(design.sizes() > 0, design.sizes(), 1.0)[known:]
         self.blocks: list[Values] = []
