@@ -24,17 +24,18 @@ MARK_AFTER_MOVES = 5.0
 FAILED, INCOMPLETE, IMPLAUSIBLE, NOT_HELD_OUT = "failed", "incomplete", "implausible", "not_held_out"
 FAR, BEYOND_ACCEPTANCE, READY = "far_above_noise", "beyond_acceptance", "ready"
 SETTING = re.compile(r"\(([a-z_.]+=\w+)\)")  # a setting within a next step
-FIGURES = {  # what decides a verdict: in the words of pages, index, terminal and ``summary.csv``, and what it is over
+FIGURES = {  # what decides a verdict: in the words of pages, index, terminal and ``summary.csv``, and its size
+    "evidence": ("evidence for", "delta BIC {:.0f}"),
     "held_out": ("held-out error", ""),  # over the noise: see ``Error``
-    "misfit": ("misfit of the fit", "noise"),
-    "scatter": ("scatter of the moves", "noise"),
-    "angle": ("angle after held-out moves", "noise"),
-    "angle_expected": ("angle after held-out moves", "the largest expected"),
+    "misfit": ("misfit of the fit", "{:.3g} x noise"),
+    "scatter": ("scatter of the moves", "{:.3g} x noise"),
+    "angle": ("angle after held-out moves", "{:.3g} x noise"),
+    "angle_expected": ("angle after held-out moves", "{:.3g} x the largest expected"),
     "dependence": ("dependence of the residual on", ""),
     "check": ("check of the recordings", ""),
-    "static": ("mean of the static recording", "the largest expected"),
-    "agreement": ("matrix on held-out motion", "U"),
-    "below": ("held-out error", "the least expected"),
+    "static": ("mean of the static recording", "{:.3g} x the largest expected"),
+    "agreement": ("matrix on held-out motion", "{:.3g} x U"),
+    "below": ("held-out error", "{:.3g} x the least expected"),
     "method": ("difference from a free fit", ""),
     "held": ("parameters that the sensor file determines", ""),
 }
@@ -117,10 +118,16 @@ KINDS = {  # the most urgent first
 }  # fmt: skip
 
 
-def decided_words(figure: str, times: float | None = None, named: str = "") -> str:
+def decided_words(figure: str, size: float | None = None, named: str = "") -> str:
     """Return the figure that decided a verdict in words: ``scatter of the moves, 7.2 x noise``."""
-    words, of = FIGURES[figure]
-    return f"{words} {named}".rstrip() + ("" if times is None or not of else f", {times:.3g} x {of}")
+    words, sized = FIGURES[figure]
+    return ", ".join(filter(None, [f"{words} {named}".rstrip(), "" if size is None else sized.format(size)]))
+
+
+def figure_and_size(words: str) -> tuple[str, str]:
+    """Return the two parts of ``decided_words``; the size may be empty."""
+    figure, _, size = words.rpartition(", ")
+    return (figure, size) if figure and re.search(r"\d", size) else (words, "")
 
 
 class Error(NamedTuple):

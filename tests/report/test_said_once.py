@@ -110,6 +110,21 @@ def test_the_figure_that_decided_a_verdict_is_the_one_that_is_said(known: Unit, 
     assert re.search(r"; held-out error \S+ x noise$", problem_words(problem))
 
 
+@pytest.mark.parametrize(
+    ("decided", "said"),
+    [
+        (("evidence", 57.3, "warm up, bias drift and hysteresis"), "hysteresis of the gyroscope, delta BIC 57."),
+        (("dependence", None, "time, temperature and rate"), "on time, temperature and rate of the gyroscope."),
+        (("held_out",), "the held-out error of the gyroscope."),
+    ],
+)
+def test_what_is_not_explained_is_said_with_its_size(known: Unit, decided: tuple[Any, ...], said: str) -> None:
+    found = known.diagnosis["gyroscope"] | {"verdict": "unexplained", "decided_by": decided_words(*decided)}
+    first = in_words(found, "gyroscope")[0]
+    assert first.startswith("No plausible effect of the catalogue explains the")
+    assert first.endswith(said)
+
+
 def test_by_hand_the_angle_after_moves_is_said_first_with_how_many_judge_it(known: Unit, tmp_path: Path) -> None:
     validation, settings = copy.deepcopy(known.validation), settings_of(known.settings, table="hand")
     angles = {"mean_deg": {"before": 1.31, "after": 0.813}, "rms_deg": {"before": 1.6, "after": 0.955}}

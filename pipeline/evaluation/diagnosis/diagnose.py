@@ -291,6 +291,7 @@ def evidence_of(
         sensor,
         found.verdict,
         tuple(found.selected),
+        max((entry.delta_bic for entry in found.chosen), default=None),
         found.residual_over_noise,
         findings.left_over_noise if findings else None,
         published=published,

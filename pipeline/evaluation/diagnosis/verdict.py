@@ -91,6 +91,7 @@ class VerdictInput:
     sensor: str
     found: Verdict  # of the selection alone
     selected: Sequence[str] = ()
+    delta_bic: float | None = None  # largest of the selected effects
     over_noise: float | None = None  # residual over the noise, of the fit without the selected effects
     left_over_noise: float | None = None  # the same with them
     published: HeldOutError | None = None  # of the unit's calibration
@@ -262,7 +263,7 @@ def _over(error: HeldOutError | None, limit: str) -> float | None:
 
 FIGURE_OF: dict[str, Callable[[VerdictInput], str]] = {  # by the reason; of all others it is the held-out error
     "doubts": lambda _: decided_words("check"),
-    "missing": lambda e: decided_words("misfit", e.over_noise),
+    "missing": lambda e: decided_words("evidence", e.delta_bic, listed([plain(name) for name in e.selected])),
     "static": lambda e: decided_words("static", _over(e.static, "high")),
     "unexplained": _of_residual,
     "moves": lambda e: decided_words("angle_expected", e.moves.over_largest if e.moves else None),

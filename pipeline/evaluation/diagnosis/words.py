@@ -10,7 +10,7 @@ from jinja2 import Environment, FileSystemLoader, Template
 
 from pipeline.core.compiled_templates import CompiledTemplates
 from pipeline.core.records import Answer
-from pipeline.core.verdicts import Verdict
+from pipeline.core.verdicts import Verdict, figure_and_size
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed
 from pipeline.estimation.design import OTHER_PREFIX
 from pipeline.physics.effects import catalogue
@@ -61,6 +61,7 @@ def _environment() -> Environment:
     environment.filters |= {"plain": plain, "listed": listed, "said": lambda answer: _said(Answer(**answer))}
     environment.globals |= {
         "is_fixed": is_fixed,
+        "figure_and_size": figure_and_size,
         "heating_and_cooling": tuple(IN_WORDS),
         "largest_by_unit": largest_by_unit,
         "plus_minus": PLUS_MINUS,
