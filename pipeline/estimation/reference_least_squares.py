@@ -29,12 +29,12 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, NotObservableError
-from pipeline.core.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageDetails, StageResult, Values
+from pipeline.core.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageResult, Values
 from pipeline.estimation.candidates import bench_effects
 from pipeline.estimation.engine import LinearMap, ScaledColumns, linear_convergence
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.monte_carlo import with_matrix
-from pipeline.estimation.stages import FitStage, StageInput
+from pipeline.estimation.stages import FitStage, StageInput, details_on_table
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, settled, used_motions
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
@@ -75,19 +75,12 @@ def fit(task: StageInput) -> SensorCalibration:
     reference = Reference(sensor, used_motions(parts), K, settings.table)
     noise = noise_of_fit(parts, reference, residuals, X, prior)
     contributions = [noise_contribution(noise, fit, prior)]
+    details = details_on_table(noise, contributions[0].degrees_of_freedom, parts, len(y), condition)
     result = StageResult(
         name=NAME,
         parameters=base_parameters(sensor, bias, matrix, contributions[0].covariance),
         residual_rms=float(np.sqrt(np.mean(residuals**2))),
-        details=StageDetails(
-            condition=condition,
-            samples_used=len(y),
-            samples_left_out=sum(part.recording.samples for part in parts) - len(y),
-            residual_rms=np.sqrt(np.mean(residuals**2, axis=0)).tolist(),
-            white_noise=noise.white.tolist(),
-            bias_wander=noise.wander.tolist(),
-            degrees_of_freedom=float(contributions[0].degrees_of_freedom.min()),
-        ),
+        details=replace(details, residual_rms=np.sqrt(np.mean(residuals**2, axis=0)).tolist()),
     )
     found = SensorCalibration(
         sensor=sensor,

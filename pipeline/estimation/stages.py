@@ -33,7 +33,6 @@ from pipeline.core.records import (
     NORMAL,
     SENSORS,
     Contribution,
-    CorrectionStep,
     Estimate,
     FittedEffect,
     Multiply,
@@ -65,13 +64,14 @@ from pipeline.estimation.uncertainty_budget import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from pipeline.core.records import Index, Noise, UnitRecordings
     from pipeline.core.settings import DataSheet, Method, Settings
     from pipeline.estimation.engine import ResidualNoise
     from pipeline.estimation.gauss_markov import WanderPrior
     from pipeline.estimation.rest_means import Rests
+    from pipeline.estimation.turns import TurnPart
 
 
 GIVEN, GIVEN_SOURCE = "given", "given calibration"
@@ -462,21 +462,15 @@ def _given(method: Method) -> dict[str, Any]:
     return method.given
 
 
-def staged_result(  # noqa: PLR0917  (the results of a stage)
-    name: str,
-    steps: Sequence[CorrectionStep],
-    parameters: Mapping[str, Estimate],
-    error: Values,
-    samples: tuple[int, int],
-    noise: ResidualNoise,
-    degrees_of_freedom: Values,
-) -> StageResult:
-    """Return the result of a stage; ``error``: of the magnitude of each sample; ``samples``: those used, and all."""
-    details = StageDetails(
-        samples_used=samples[0],
-        samples_left_out=samples[1] - samples[0],
+def details_on_table(
+    noise: ResidualNoise, freedom: Values, parts: Sequence[TurnPart], used: int, condition: float | None = None
+) -> StageDetails:
+    """Return the details of a fit to samples of a table's turns; ``used``: number of samples."""
+    return StageDetails(
+        samples_used=used,
+        samples_left_out=sum(part.recording.samples for part in parts) - used,
+        condition=condition,
         white_noise=noise.white.tolist(),
         bias_wander=noise.wander.tolist(),
-        degrees_of_freedom=float(degrees_of_freedom.min()),
+        degrees_of_freedom=float(freedom.min()),
     )
-    return StageResult(name, parameters, float(np.sqrt(np.mean(error**2))), tuple(steps), details)

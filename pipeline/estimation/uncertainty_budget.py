@@ -298,6 +298,14 @@ def clock_contribution(
     return type_b(TIME_BASE, distribution, ppm, "ppm", effect, remark)
 
 
+def clock_line(calibration: SensorCalibration, table: Table) -> tuple[list[Contribution], dict[str, str]]:
+    """Return the contribution of the sensor's clock as the table states it, or why there is none."""
+    ppm = table.clock_accuracy_ppm
+    if ppm is None:
+        return [], {TIME_BASE: "table.clock_accuracy_ppm is not stated"}
+    return [clock_contribution(calibration, ppm)], {}
+
+
 def limit_contribution(
     gain: Values, of_limits: Values, curvature: Values, covariance: Values, place: Values
 ) -> tuple[Contribution, Values]:

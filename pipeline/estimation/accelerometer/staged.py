@@ -38,6 +38,7 @@ from pipeline.core.records import (
     FittedEffect,
     Recording,
     SensorCalibration,
+    StageResult,
     Subtract,
     TwoSided,
     Values,
@@ -56,7 +57,7 @@ from pipeline.estimation.accelerometer.turn_extremes import (
     turns_of,
 )
 from pipeline.estimation.engine import LinearMap, ResidualNoise
-from pipeline.estimation.stages import FitStage, StageInput, staged_result
+from pipeline.estimation.stages import FitStage, StageInput, details_on_table
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import noise_of_turns, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import (
@@ -295,7 +296,8 @@ def fit(task: StageInput) -> SensorCalibration:
 
     found = estimator.after([name], CorrectedForces.of(previous))
     # A separate sinusoid for each turn and channel would absorb the changes of the bias from turn to turn.
-    noise = noise_of_turns([part for turn in turns for part in turn.parts], prior, settings.table, two_sided=True)
+    parts = [part for turn in turns for part in turn.parts]
+    noise = noise_of_turns(parts, prior, settings.table, two_sided=True)
     if estimator.as_printed:
         scatter = _resampled(turns, sinusoids, noise, gravity_g, [*before, name])
     else:
@@ -303,15 +305,10 @@ def fit(task: StageInput) -> SensorCalibration:
         scatter = noise_contribution(noise, map_, prior)
     after = corrected(found.steps, np.concatenate([turn.reading for turn in turns]))
     after_c = BASE_COUNT + len(found.c)
-    result = staged_result(
-        name,
-        found.steps,
-        stage_parameters(found.values, scatter.covariance[after_c:, after_c:]),
-        np.linalg.norm(after, axis=1) - gravity_g,
-        (len(after), sum(part.recording.samples for turn in turns for part in turn.parts)),
-        noise,
-        scatter.degrees_of_freedom,
-    )
+    parameters = stage_parameters(found.values, scatter.covariance[after_c:, after_c:])
+    rms = float(np.sqrt(np.mean((np.linalg.norm(after, axis=1) - gravity_g) ** 2)))
+    details = details_on_table(noise, scatter.degrees_of_freedom, parts, len(after))
+    result = StageResult(name, parameters, rms, tuple(found.steps), details)
     last, named = name == "scale_factor", effect(ASYMMETRY).parameters("accelerometer")
     asymmetry = {p.name: Coefficient(float(v), p.unit) for p, v in zip(named, found.c, strict=True)}
     calibration = SensorCalibration(
@@ -325,8 +322,7 @@ def fit(task: StageInput) -> SensorCalibration:
     kept = slice(0, after_c) if last else BASE
     if estimator.as_printed:
         return combined(calibration, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
-    motions = used_motions([part for turn in turns for part in turn.parts])
-    reference = Reference("accelerometer", motions, np.diag(found.k), settings.table)
+    reference = Reference("accelerometer", used_motions(parts), np.diag(found.k), settings.table)
 
     def results(errors: Values) -> Values:
         return np.array([chain(theta + e)[kept] for e in errors])

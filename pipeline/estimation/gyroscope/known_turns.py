@@ -34,8 +34,7 @@ from pipeline.estimation.multi_position.faces_and_turns import across_axis, turn
 from pipeline.estimation.multi_position.gyroscope import between_recordings
 from pipeline.estimation.multi_position.result import NOT_INCLUDED
 from pipeline.estimation.rest_means import rests_of
-from pipeline.estimation.table_errors import TIME_BASE
-from pipeline.estimation.uncertainty_budget import clock_contribution, combined, scatter_contribution, stage_parameters
+from pipeline.estimation.uncertainty_budget import clock_line, combined, scatter_contribution, stage_parameters
 
 if TYPE_CHECKING:
     from pipeline.core.records import UnitRecordings, Values
@@ -125,13 +124,7 @@ def covariances(known: KnownTurns, A: Values, columns: ScaledColumns) -> tuple[V
 
 def with_budget(found: SensorCalibration, of_noise: Values, of_stated: Values, settings: Settings) -> SensorCalibration:
     """Return a calibration with its budget; both covariances are of bias and matrix, (12, 12)."""
-    free, missing = np.full(BASE_COUNT, np.inf), dict(NOT_INCLUDED)
-    lines: list[Contribution] = [
-        scatter_contribution(of_noise, np.inf, remark="white noise, bias wander, and the bias of each recording"),
-        Contribution(ANGLES, "B", NORMAL, of_stated, free),
-    ]
-    if settings.table.clock_accuracy_ppm is None:
-        missing[TIME_BASE] = "table.clock_accuracy_ppm is not stated"
-    else:
-        lines.append(clock_contribution(found, settings.table.clock_accuracy_ppm))
-    return combined(found, lines, missing)
+    noise = scatter_contribution(of_noise, np.inf, remark="white noise, bias wander, and the bias of each recording")
+    angles = Contribution(ANGLES, "B", NORMAL, of_stated, np.full(BASE_COUNT, np.inf))
+    clock, missing = clock_line(found, settings.table)
+    return combined(found, [noise, angles, *clock], NOT_INCLUDED | missing)

@@ -37,13 +37,14 @@ from pipeline.core.records import (
     Multiply,
     Recording,
     SensorCalibration,
+    StageResult,
     Subtract,
     Values,
     corrected,
     motion_at_rest,
 )
 from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative
-from pipeline.estimation.stages import FitStage, StageInput, staged_result
+from pipeline.estimation.stages import FitStage, StageInput, details_on_table
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
@@ -199,15 +200,9 @@ def fit(task: StageInput) -> SensorCalibration:
     scatter = noise_contribution(noise, map_, prior)
     after = corrected(found.steps, samples.reading)
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(samples.rate, axis=1)
-    result = staged_result(
-        name,
-        found.steps,
-        stage_parameters(found.values, scatter.covariance[AFTER_BASE, AFTER_BASE]),
-        error,
-        (len(after), sum(part.recording.samples for part in samples.parts)),
-        noise,
-        scatter.degrees_of_freedom,
-    )
+    parameters = stage_parameters(found.values, scatter.covariance[AFTER_BASE, AFTER_BASE])
+    details = details_on_table(noise, scatter.degrees_of_freedom, samples.parts, len(after))
+    result = StageResult(name, parameters, float(np.sqrt(np.mean(error**2))), tuple(found.steps), details)
     offset, matrix = found.contract()
     condition, columns = ScaledColumns.of(design).condition, design.shape[1]
     calibration = SensorCalibration(

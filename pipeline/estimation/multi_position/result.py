@@ -36,13 +36,12 @@ from pipeline.estimation.multi_position.model import Model, State, prior_hypothe
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.stages import is_given, unknown_uncertainty
-from pipeline.estimation.table_errors import TIME_BASE
 from pipeline.estimation.uncertainty_budget import (
     TEMPERATURE,
     base_parameters,
     changes_by_hand,
     changes_through_gravity,
-    clock_contribution,
+    clock_line,
     combined,
     effect_parameters,
     gain_of,
@@ -141,14 +140,9 @@ def after_stage(
         parts = NoiseParts(np.sqrt(white), wander_and_scatter=np.sqrt(variance - white))
     scatter = scatter_contribution(covariance - of_limit, np.inf, parts, REMARK[sensor])
     lines, missing = [replace(scatter, degrees_of_freedom=freedom)], dict(not_included)
-    if sensor == "accelerometer":
-        gravity, unstated = gravity_line(calibration, table)
-        lines, missing = lines + gravity, missing | unstated
-    else:
-        if table.clock_accuracy_ppm is None:
-            missing[TIME_BASE] = "table.clock_accuracy_ppm is not stated"
-        else:
-            lines.append(clock_contribution(calibration, table.clock_accuracy_ppm))
+    stated, unstated = (gravity_line if sensor == "accelerometer" else clock_line)(calibration, table)
+    lines, missing = lines + stated, missing | unstated
+    if sensor == "gyroscope":
         if is_given("accelerometer", settings.method):
             missing |= unknown_uncertainty("accelerometer", settings.method)
         missing["Earth's rotation"] = "not in the model: by hand the heading is unknown; up to 0.0042 deg/s of bias"
