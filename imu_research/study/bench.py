@@ -90,7 +90,7 @@ def recordings_of(case: StudyCase) -> list[Recording]:
         "unit",
         sensor=case.model,
         table=case.table,
-        procedure=case.procedure if case.by_hand else "three_axis_turns",
+        procedure=case.procedure if case.by_hand else "thermal_ramp" if case.kind == "lag" else "three_axis_turns",
         course=course,
         interval_s=_interval(case),
         lost=0.1 if case.noise == "lost" else 0.0,

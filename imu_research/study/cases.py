@@ -17,6 +17,7 @@ The family, the number and the study's seed determine a case. Families:
     cycle_<shape>        such a function of temperature, in a room that warms and cools by some degrees
     staged               one effect, in a unit whose base is calibrated stage by stage
     limit_<percent>      one effect at 30, 60 or 100 % of its detection size (``imu_research.study.bench.at_detection``)
+    lag                  bias over temperature, x0.3, and a lag of the thermometer, in a chamber that heats and cools
 
 Effects have the size that the data sheet states: for the MPU-6050 the MPU-6000/6050 product specification 3.4, for the
 STIM300 its data sheet TS1524 and that of the STIM210's gyroscopes. Other sizes, like the shares and rates below, are
@@ -50,7 +51,7 @@ FAMILIES = (
     "removed", "one_axis", *(f"shape_{shape}" for shape in SHAPES), "lost", "coarse", "cold",
     *(f"cycle_{shape}" for shape in OF_TEMPERATURE), "staged", "limit_30", "limit_60", "limit_100", "null_sensors",
     *(f"null_hand_{noise}" for noise in ("white", "normal", "wander", "random_walk")),
-    *(f"hand_{procedure}" for procedure in ("multi_position", "ferraris", "orientations_24")),
+    *(f"hand_{procedure}" for procedure in ("multi_position", "ferraris", "orientations_24")), "lag",
 )  # fmt: skip  # a new one goes last: its place is part of every case's random numbers
 # Long recordings at several rates, so that each observable effect can be detected.
 LONG: dict[str, Any] = {"rates_dps": (20.0, 60.0, 100.0, 200.0), "static_s": 300.0}
@@ -65,7 +66,7 @@ ALTERNATIVES = [  # not hidden together: their signals are nearly alike
     {"bias_temperature", "bias_temperature_quadratic"},
     {"table_rate_ripple", "table_encoder_error"},
 ]
-FACTOR = {"small": 0.3, "tiny": 0.1}  # of the sensor file's size
+FACTOR = {"small": 0.3, "tiny": 0.1, "lag": 0.3}  # of the sensor file's size
 WANDER = {"white": 0.0, "normal": 1.0, "wander": 5.0, "random_walk": 0.0, "one_over_f": 0.0}  # of the sensor file's
 STIM_SHARE = 0.25  # of the units of the families that have both models
 METHODS = REFERENCE, STAGED, METHODS_OF_HAND_HELD_CASES = (
@@ -81,6 +82,7 @@ TABLE_SHARES = {
 }  # and their shares; the last takes 20 times as long
 RESTS_BY_HAND = 15, 40  # by hand; from 15 on, some are held out of a fit
 CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
+LAG_S = 10.0, 60.0  # of a thermometer, by assumption: packages of grams
 TABLE = {  # deg; ripple relative: a table of hobby parts, by assumption
     "table_tilt": 0.2,
     "table_axis_nonorthogonality": 0.1,
@@ -261,13 +263,10 @@ def draw(family: str, number: int, seed: int) -> StudyCase:
         return replace(case, method=METHODS_OF_HAND_HELD_CASES)
     if kind == "unseen":
         return _unseen(number, seed, rng)
-    if kind == "staged":
-        procedure = "stop_and_go"  # the method needs rests, and turns in both directions
+    if kind in ("staged", "lag"):
+        procedure = "stop_and_go"  # the method needs rests, and turns in both directions; a lag needs time
     names = _names(kind, model, sensor, procedure, rng)
-    hidden = {name: drawn(model, sensor, name, rng, FACTOR.get(family, 1.0)) for name in names}
-    if kind == "one":  # parameters are in the order of the axes
-        for values in hidden.values():
-            values.reshape(3, -1)[np.arange(3) != rng.integers(3)] = 0.0
+    hidden = _hidden(kind, names, model, sensor, rng)
     return replace(
         StudyCase(family, number, seed, model, sensor, procedure),
         hidden={name: values.tolist() for name, values in hidden.items()},
@@ -278,8 +277,19 @@ def draw(family: str, number: int, seed: int) -> StudyCase:
     )
 
 
+def _hidden(kind: str, names: list[str], model: str, sensor: str, rng: np.random.Generator) -> dict[str, Values]:
+    """Draw the parameters of effects."""
+    hidden = {name: drawn(model, sensor, name, rng, FACTOR.get(kind, 1.0)) for name in names}
+    if kind == "one":  # parameters are in the order of the axes
+        for values in hidden.values():
+            values.reshape(3, -1)[np.arange(3) != rng.integers(3)] = 0.0
+    if kind == "lag":
+        hidden["temperature_lag"] = hidden["bias_temperature"] * rng.uniform(*LAG_S)
+    return hidden
+
+
 def _names(kind: str, model: str, sensor: str, procedure: str, rng: np.random.Generator) -> list[str]:
-    pool = observable(model, sensor, procedure)
+    pool = ["bias_temperature"] if kind == "lag" else observable(model, sensor, procedure)
     if kind == "one":
         pool = [name for name in pool if len(effect(name).parameters(sensor)) % 3 == 0 and name != "lever_arm"]
     if kind == "cold":

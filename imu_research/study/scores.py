@@ -146,6 +146,7 @@ SCORED_FAMILIES: list[tuple[str, str, Callable[[ScoredCase], bool], str]] = [
     ("pairs", "two effects: exactly these", exact, ">= 95 %"),
     ("pairs_wander", "two effects, five times the wander: exactly these", exact, ">= 85 %"),
     ("triples", "three effects: exactly these", exact, ""),
+    ("lag", "bias over temperature and the lag of the thermometer, in a chamber: exactly these", exact, ""),
     ("hand_multi_position", "by hand, rests in 15 to 40 attitudes, one effect: no other named", no_other, ">= 98 %"),
     ("hand_ferraris", "by hand, faces and turns, one effect: no other named", no_other, ">= 98 %"),
     ("hand_orientations_24", "by hand, 24 orientations, one effect: no other named", no_other, ">= 98 %"),

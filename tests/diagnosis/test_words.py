@@ -2,11 +2,12 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline.estimation.posterior import Answers
 from pipeline.evaluation.diagnosis.findings import next_experiment
-from pipeline.evaluation.diagnosis.words import PLUS_MINUS, in_words
+from pipeline.evaluation.diagnosis.words import PLUS_MINUS, in_words, times_of
 from pipeline.physics.effects import catalogue
 from tests.published import candidate
 
@@ -138,3 +139,17 @@ def test_an_effect_that_contains_another_needs_no_distinction() -> None:
     said = next_experiment("missing_effect", entries, Found())  # type: ignore[arg-type]
     assert said == f"to confirm lever arm: {catalogue()['lever_arm'].experiment}"
     assert "moved by a known distance" in said
+
+
+def test_a_lag_is_said_in_seconds_by_the_mean_of_the_axes_that_show_it_best() -> None:
+    def entry(name: str, values: list[float], errors: list[float]) -> dict[str, Any]:
+        pairs = enumerate(zip(values, errors, strict=True))
+        return {"effect": name, "parameters": {k: {"value": v, "standard_uncertainty": u} for k, (v, u) in pairs}}
+
+    slope = entry("bias_temperature", [0.1, -0.2, 1e-9], [1e-4] * 3)
+    lag = entry("temperature_lag", [3.0, -6.0, 0.5], [0.1, 0.1, 0.5])  # 30 s; the last axis shows nothing
+    ((time, u),) = times_of(lag, {"bias_temperature": slope})
+    assert time == pytest.approx(30.0, rel=1e-6)
+    assert u == pytest.approx(0.1 / np.hypot(0.1, 0.2), rel=1e-6)
+    assert not times_of(lag, {})
+    assert not times_of(slope, {"bias_temperature": slope})

@@ -65,6 +65,7 @@ def _environment() -> Environment:
         "heating_and_cooling": tuple(IN_WORDS),
         "largest_by_unit": largest_by_unit,
         "plus_minus": PLUS_MINUS,
+        "times_of": times_of,
     }
     environment.globals |= {"stays": STAYS, "unchanged": UNCHANGED, "Verdict": Verdict}
     return environment
@@ -105,6 +106,24 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
 def plain(name: str) -> str:
     """Return the name of an effect, verdict, setting or covariate in words: ``bias temperature``."""
     return IN_WORDS.get(name) or name.replace("_", " ")
+
+
+def times_of(entry: Mapping[str, Any], entries: Mapping[str, Mapping[str, Any]]) -> list[tuple[float, float]]:
+    """Return the time constant of an effect that scales with another one, and its standard uncertainty, s; or nothing.
+
+    ``entry``, ``entries``: of the ranking. The weighted mean of the axes' ratios; each weight is by the uncertainty of
+    the effect itself, which is larger than that of the other.
+    """
+    this = catalogue().get(entry["effect"])
+    other = entries.get(this.scales_with) if this else None
+    if other is None or not other["parameters"] or len(other["parameters"]) != len(entry["parameters"]):
+        return []
+    pairs = list(zip(entry["parameters"].values(), other["parameters"].values(), strict=True))
+    if not all(own["standard_uncertainty"] for own, _ in pairs):
+        return []
+    weight = sum((scale["value"] / own["standard_uncertainty"]) ** 2 for own, scale in pairs)
+    mean = sum(own["value"] * scale["value"] / own["standard_uncertainty"] ** 2 for own, scale in pairs) / weight
+    return [(mean, weight**-0.5)]
 
 
 def listed(words: Sequence[str], conjunction: str = "and") -> str:
