@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from pipeline.app.commands.add import changed_files
 from pipeline.app.commands.convert import main as convert
 from pipeline.app.one_unit import unit_of_recordings
 from pipeline.evaluation.held_out.reduced import HELD
-from pipeline.output.exports import formats
+from pipeline.output.exports import ExportedUnit, formats
 from pipeline.physics.effects import catalogue
 from pipeline.physics.effects.base import Owner
 from pipeline.simulation.campaign import simulate_unit
@@ -96,3 +97,24 @@ def test_convert_writes_the_values_of_the_run(tmp_path: Path) -> None:
     written, of_run = ([line for line in text.splitlines() if "\tCAL_ACC0" in line] for text in texts)
     assert written == of_run
     assert len(written) > 5
+
+
+def test_add_makes_no_file_worse_that_cannot_hold_an_effect_of_gravity_and_names_files_that_change() -> None:
+    effects = {"gyroscope.g_sensitivity": [0.3, -0.1, 0.2, 0.1, 0.4, -0.2, 0.1, 0.2, 0.5]}
+    recordings, _ = simulate_unit(UnitDescription("U", table="hand", procedure="ferraris", effects=effects), 7, 0)
+    layers = ["table=hand", "procedure=ferraris", "method=rests_and_moves"]
+    before, after = (
+        unit_of_recordings(recordings, [*layers, f"effects.gyroscope=[{names}]"]).run_to("calibration")
+        for names in ("", "g_sensitivity")
+    )
+    was, now = (ExportedUnit(s.calibration, {}, validation=s.validation) for s in (before, after))
+    file = ("gyroscope", "px4.params")
+    error = was.held_out_errors(less=False)[file]
+    assert now.held_out_errors(less=True)[file] < 1.01 * error
+    assert changed_files("U", was, was) == []
+    worse = next(r for r in now.validation["gyroscope"]["reduced"] if r["part"] == "none")
+    worse["rms_error"] = 1.2 * error
+    (line,) = [line for line in changed_files("U", was, now) if "px4.params" in line]
+    assert line.startswith(
+        f"U, gyroscope, held-out error of files that hold less {error:.3g} -> {1.2 * error:.3g} deg/s: "
+    )

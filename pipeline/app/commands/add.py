@@ -25,8 +25,9 @@ from pipeline.app.config.owner import require_own_results
 from pipeline.core.errors import ConfigurationError, MissingInputError, PipelineError, shortened
 from pipeline.core.files import write_atomically
 from pipeline.core.pack import read_published
-from pipeline.core.records import SENSORS
+from pipeline.core.records import SENSOR_UNITS, SENSORS
 from pipeline.core.verdicts import Verdict
+from pipeline.output.exports import ExportedUnit
 from pipeline.output.outcome import DEFAULT_RESULTS, NAMED_PER_LINE, changes_of, read_summary, run_command
 from pipeline.physics.effects import catalogue
 
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 
 OVERRIDES_KEY = "overrides"
+SMALLEST_CHANGE_OF_A_FILE = 0.1  # of its held-out error, which is said
 EPILOG = """\
 Added effects are part of the model of the unit in every run, until they are removed. The run repeats the stages that
 depend on them, and its last lines state the change of the held-out error.
@@ -321,8 +323,9 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
         print(f"then: {command}")
         return 0
     print(f"runs: {command}", flush=True)
-    code = run_snakemake(arguments, arguments.config)
     results = Path(arguments.results) / directory.name
+    before = {unit: _published(results, unit) for unit in effects_of}
+    code = run_snakemake(arguments, arguments.config)
     own = changes_of(results, list(effects_of)) if code == 0 else []
     print(
         "\n".join(
@@ -330,7 +333,32 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
             or ["no sensor of these units has another error"] * (code == 0)
         )
     )
+    after = {unit: _published(results, unit) for unit in effects_of} if code == 0 else {}
+    lines = [line for unit, now in after.items() for line in changed_files(unit, before[unit], now)]
+    print("".join(f"{line}\n" for line in shortened(lines, NAMED_PER_LINE, "changes of files")), end="")
     return code
+
+
+def _published(results: Path, unit: str) -> ExportedUnit | None:
+    """Return the published documents of a unit; None where there are none."""
+    try:
+        documents = [json.loads(read_published(results / d / f"{unit}.json")) for d in ("calibrations", "validations")]
+    except FileNotFoundError:
+        return None
+    return ExportedUnit(documents[0], {}, validation=documents[1])
+
+
+def changed_files(unit: str, before: ExportedUnit | None, after: ExportedUnit | None) -> list[str]:
+    """Return a line on each change of the error of files of other programs that hold less than the calibration."""
+    if before is None or after is None:
+        return []
+    was, files = before.held_out_errors(less=False), dict[str, list[str]]()
+    for (sensor, file), now in after.held_out_errors(less=True).items():
+        error = was.get((sensor, file))
+        if error and abs(now / error - 1.0) > SMALLEST_CHANGE_OF_A_FILE:
+            change = f"{unit}, {sensor}, held-out error of files that hold less {error:.3g} -> {now:.3g}"
+            files.setdefault(f"{change} {SENSOR_UNITS[sensor]}", []).append(file)
+    return [f"{change}: {', '.join(names)}" for change, names in files.items()]
 
 
 def _bench_note(effects: Iterable[tuple[str, str]]) -> str:

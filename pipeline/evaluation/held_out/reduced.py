@@ -7,7 +7,7 @@ that a format holds, the accelerometer's matrix S and bias b minimise
 
 A gyroscope turns to one side more than to the other, so that a fitted bias would not be that at rest: its diagonal is
 ``s_i = K_ii / |K_i|^2``, with K the inverse of the full matrix, and its bias contains the mean of the effects that are
-not held and depend on time and temperature alone.
+not held and do not depend on the rate, as the bias of a fit without them does.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ HELD: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("none", BIAS_OVER_TEMPERATURE),
 )
 FEWEST_ROWS = 6  # orientations, of which an axis has an offset and three factors
-AT_REST_TOO = {"time", "temperature"}  # signals
+AT_REST_TOO = {"time", "temperature", "specific_force"}  # signals
 
 
 def reduced(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) -> list[Reduced]:
@@ -66,7 +66,7 @@ def reduced(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) ->
             continue
         effects = tuple(e for e in calibration.effects if e.name in kept or e.name not in own)
         partial = replace(calibration, effects=effects)
-        if calibration.sensor == "gyroscope":  # effects of the motion have no mean that a log would have
+        if calibration.sensor == "gyroscope":  # effects of the rate have no mean that a rest would have
             partial = replace(calibration, effects=tuple(e for e in calibration.effects if e in effects or _moving(e)))
         left = truth if partial.effects == calibration.effects else _calibrated(partial, fitted)
         bias, matrix = _fitted(calibration, part, left, truth)
@@ -77,7 +77,7 @@ def reduced(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) ->
 
 
 def _moving(fitted: FittedEffect) -> bool:
-    """Return whether an effect depends on more than time and temperature."""
+    """Return whether an effect depends on more than is there at rest."""
     return not effect_of(fitted).fields("gyroscope", fitted.values) <= AT_REST_TOO
 
 

@@ -188,6 +188,17 @@ class ExportedUnit:
                 return Reduced(**entry)
         return None
 
+    def held_out_errors(self, *, less: bool) -> dict[tuple[str, str], float]:
+        """Return the held-out rms error of each sensor and file; ``less``: of those that hold less alone."""
+        errors = {}
+        for declared, _ in formats().values():
+            for name, sensor in self.sensors(declared).items():
+                steps = ((self.validation or {}).get(name) or {}).get("steps") or [{}]
+                error = sensor.held.rms_error if sensor.held else steps[-1].get("rms_error")
+                if error and (sensor.held or not less):
+                    errors[name, declared.file] = error
+        return errors
+
 
 def exports(
     calibration: JSON, settings: Settings, validation: JSON | None = None, diagnosis: JSON | None = None
