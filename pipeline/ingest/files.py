@@ -79,17 +79,34 @@ def parts_of(ingest: Ingest) -> Sequence[Mapping[str, str]]:
     return found
 
 
+def grouped(files: Sequence[Path], ingest: Ingest) -> list[list[Path]]:
+    """Return the files of each recording: one, or one for each part of the profile."""
+    parts, of_messages = [part["file"] for part in parts_of(ingest)], bool(ingest.mcap.get("parts"))
+    groups: dict[Path, list[Path]] = {}
+    for file in files:
+        if not parts or (file.suffix.lower() in SUFFIXES[1:] and not of_messages):
+            groups[file] = [file]
+            continue
+        patterns = [re.escape(p).replace(re.escape(FILE), "(.+)") for p in parts]
+        match = next((m for p in patterns if (m := re.fullmatch(p, file.name))), None)
+        if match is None:
+            raise ConfigurationError(f"matches none of the profile's parts ({', '.join(parts)})", str(file))
+        stem = match.group(1) if match.groups() else ""
+        groups[file.parent / stem] = [file.parent / p.replace(FILE, stem) for p in parts]
+    return list(groups.values())
+
+
 def _owner_of_parts(recordings: Mapping[str, RecordingFile], parts: Sequence[Mapping[str, str]]) -> str | None:
     """Return the recording to which parts with fixed names belong; None if their names contain ``{file}``."""
     fixed = [part["file"] for part in parts if FILE not in part["file"]]
-    if not fixed:
+    if not fixed or not recordings:  # a sheet that cannot be used says so where it is read
         return None
     required = [name for name, entry in recordings.items() if not entry.optional]
     if len(required) != 1:
         raise ConfigurationError(
             f"parts of the ingest profile names {', '.join(fixed)} without {FILE}, which suits a procedure with one "
-            f"required recording; this one requires {', '.join(required)}: write {FILE} where the recording's name "
-            "belongs"
+            f"required recording; this one requires {', '.join(required) or 'none'}: write {FILE} where the "
+            f'recording\'s name belongs, as in "{FILE}_{fixed[0]}", and name the files so'
         )
     return required[0]
 

@@ -249,6 +249,49 @@ def test_parts_of_one_recording_are_read_together(tmp_path: Path, capsys: pytest
     assert "the rates agree with the rotation of gravity" in checked.words
 
 
+def in_counts(folder: Path, names: tuple[str, str]) -> None:
+    """Write a log in two files, as the shipped profile of an Xsens states them."""
+    log = make_log()
+    for name, readings, scale in zip(names, (log.accelerometer, log.gyroscope), (4070.0, 83.2), strict=True):
+        assert readings is not None
+        counts = 32768.0 + np.rint(scale * readings)
+        np.savetxt(folder / name, np.column_stack([log.time, counts]), fmt="%.6e")
+
+
+def test_a_shipped_profile_that_fits_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    in_counts(tmp_path, ("accelerometer.txt", "gyroscope.txt"))
+    checked = Checked(capsys, *sorted(tmp_path.iterdir()))
+    assert "SHIPPED PROFILE: xsens_mti_multi_position reads" in checked.words
+    assert "check by --ingest xsens_mti_multi_position" in checked.words
+    assert Checked(capsys, *sorted(tmp_path.iterdir()), "--ingest", "xsens_mti_multi_position").code == 0
+
+
+@pytest.mark.parametrize("names", [("accelerometer.txt", "gyroscope.txt"), ("{file}_a.txt", "{file}_g.txt")])
+def test_of_a_log_in_two_files_the_sheet_has_one_row_and_the_only_profile_is_used_and_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], names: tuple[str, str]
+) -> None:
+    folder, profile = tmp_path / "raw" / "U1", tmp_path / "configs" / "ingest" / "mine.yaml"
+    folder.mkdir(parents=True)
+    profile.parent.mkdir(parents=True)
+    text = (REPOSITORY / "configs" / "ingest" / "xsens_mti_multi_position.yaml").read_text()
+    profile.write_text(text.replace("accelerometer.txt", f"'{names[0]}'").replace("gyroscope.txt", f"'{names[1]}'"))
+    (tmp_path / "units.csv").write_text("unit,sensor,table,procedure\nU1,generic,hand,listed\n")
+    in_counts(folder, (names[0].replace("{file}", "s"), names[1].replace("{file}", "s")))
+    (folder / "recordings.csv").write_text("file,kind\n")
+    row = f"{'s' if '{file}' in names[0] else 'log'},rest"
+    proposed = Checked(capsys, "--campaign", tmp_path)
+    assert row in proposed.out.splitlines()
+    assert f"read with {profile}: no setting names it, write ingest=mine into campaign.yaml" in proposed.words
+    (tmp_path / "campaign.yaml").write_text("overrides: [ingest=mine]\n")
+    assert "read with" not in Checked(capsys, "--campaign", tmp_path).words
+    (folder / "recordings.csv").write_text(f"file,kind\n{row}\n")
+    assert Checked(capsys, folder / names[0].replace("{file}", "s")).code == 0
+    (folder / "recordings.csv").write_text("file,kind\na,rest\nb,rest\n")
+    if row.startswith("log"):
+        assert main(["check", "--campaign", str(tmp_path)]) == 2
+        assert "this one requires a, b: write {file} where" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "file", ["mpu6050_multi_position/example_data_calibration.csv", "mpu6050_multi_position/imu_90_x_rot.csv"]
 )

@@ -124,7 +124,7 @@ def _files(logs: Sequence[Path], profile: LogProfile) -> list[Path]:
 
         parts = sensor_parts(profile.ingest, messages=suffix in MESSAGE_FORMATS)
         if len(parts) > 1:
-            from pipeline.app.commands.readings import grouped  # noqa: PLC0415  (imports Hydra: 0.3 s)
+            from pipeline.ingest.files import grouped  # noqa: PLC0415
 
             recordings = grouped(logs, profile.ingest)
             if len(recordings) > 1:

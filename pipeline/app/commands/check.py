@@ -16,20 +16,29 @@ from imu_logs.files import SUFFIXES
 from imu_logs.guesses import TO_DECIDE
 from imu_logs.proposal import as_yaml, layouts_of, not_found
 from pipeline.app.commands import parser_of
-from pipeline.app.commands.readings import Reading, campaign_of, config_of_log, grouped, recordings_of_files
+from pipeline.app.commands.readings import Reading, campaign_of, config_of_log, recordings_of_files
 from pipeline.app.config.campaign import find_campaign, load_campaign
 from pipeline.app.config.options import nearest
 from pipeline.app.one_unit import try_unit, unit_of_campaign
-from pipeline.app.profile_detection.recording_facts import as_text, counted, facts, proposed_sheet, topic_lines
+from pipeline.app.profile_detection.recording_facts import (
+    as_text,
+    counted,
+    facts,
+    has_rows,
+    proposed_sheet,
+    shows_gravity,
+    topic_lines,
+)
 from pipeline.app.profile_detection.unit_guesses import propose
 from pipeline.app.run_progress import Countdown
 from pipeline.core.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, shortened
-from pipeline.core.files import write_atomically
+from pipeline.core.files import CONFIGS, write_atomically
 from pipeline.core.records import SENSORS
 from pipeline.core.settings import Ingest, settings_of_ranges
-from pipeline.ingest.files import FILE, recording_files
+from pipeline.ingest.files import FILE, grouped, recording_files
 from pipeline.output.outcome import NAMED_PER_LINE, as_overrides, found_mountings
 from pipeline.physics.statements import LEFT_OUT_REASONS
+from pipeline.simulation.description import read_option
 
 if TYPE_CHECKING:
     import argparse
@@ -146,6 +155,7 @@ def main(argv: Sequence[str]) -> int:
     unknown = [(r.reading, layout) for r in refused if r.reading for layout in _layouts(r.reading, r.code)]
     if unknown:
         sensor_model = unknown[0][0].sensor_model
+        _print_shipped([file for reading, _ in unknown for file in reading.files])
         _print_proposals(propose([layout for _, layout in unknown], sensor_model), sensor_model, arguments.save)
     elif arguments.save:
         print(f"{arguments.save} was not written: no profile is proposed")
@@ -230,7 +240,9 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Outcome]]]:
             )
         chosen, others = recordings_of_files(files, campaign, known) if files else ({unit: [] for unit in known}, [])
         saved = SavedProfiles(directory)
-        checks = {f"unit {unit}": partial(_check_unit, unit=unit, names=names) for unit, names in chosen.items()}
+        checks = {
+            f"unit {unit}": partial(_check_unit, unit=unit, names=names, saved=saved) for unit, names in chosen.items()
+        }
         for log in _logs_of_campaign(others, campaign, known) if others else []:
             checks[str(log.files[0])] = partial(_check_log_of_campaign, files=log.files, units=known)
         tasks += [(what, partial(_check_or_saved, check, campaign, saved)) for what, check in checks.items()]
@@ -315,7 +327,7 @@ def _check_log_of_campaign(campaign: Campaign, files: Sequence[Path], units: Seq
     return _check_log(reading)
 
 
-def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
+def _check_unit(campaign: Campaign, unit: str, names: Sequence[str], saved: SavedProfiles) -> Outcome:
     """Return the result of a run for a unit: content and notes of the named recordings, or a summary of all."""
     configured, missing = unit_of_campaign(campaign, unit), ""
     trial = try_unit(configured, "fit", fits=False) if names else try_unit(configured, "calibration")
@@ -342,11 +354,7 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
         file = [("file", trial.failure["file"])] if trial.failure["file"] else []
         lines = [*file, ("REFUSED", trial.failure["message"]), ("code", trial.failure["code"])]
         texts.append(f"unit {unit} of campaign {campaign.name}\n{as_text(lines)}")
-        config, folder = campaign.units[unit].config, campaign.folder(unit)
-        if config.procedure.sheet and not config.procedure.recordings and folder.is_dir():
-            proposed = proposed_sheet(folder, config)
-            head = f"PROPOSED {folder / config.procedure.sheet}, by what the files show; correct it:"
-            texts += [f"{head}\n\n{proposed}"] if proposed else []
+        texts += _sheet_proposed(campaign, unit, saved)
     elif not names and not refused:
         document = trial.state.calibration or {}
         lines = [(sensor, f"null: {reason}") for sensor, reason in document["not_calibrated"].items()]
@@ -366,6 +374,24 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Outcome:
         texts.append("\n".join([head, *([as_text(lines)] if lines else [])]))
     mounted = {r.name: n.settings for r in checked for n in r.notes if n.settings}
     return Outcome("\n\n".join([*texts, *([missing] if missing else [])]), refused, unit, mounted)
+
+
+def _sheet_proposed(campaign: Campaign, unit: str, saved: SavedProfiles) -> list[str]:
+    """Return a proposed sheet where there is none, read by a saved profile where the settings' reads no file."""
+    config, folder = campaign.units[unit].config, campaign.folder(unit)
+    if not config.procedure.sheet or config.procedure.recordings or not folder.is_dir():
+        return []
+    texts, used = [proposed_sheet(folder, config)], ""
+    for file, other in saved.campaigns.items() if not has_rows(texts[0]) else ():
+        texts.append(proposed_sheet(folder, other.units[unit].config))
+        if has_rows(texts[-1]):
+            used = f", read with {file}: no setting names it, write ingest={file.stem} into campaign.yaml"
+            break
+    proposed = texts[-1] if used else texts[0]
+    if not proposed:
+        return []
+    head = f"PROPOSED {folder / config.procedure.sheet}, by what the files show{used}; correct it:"
+    return [f"{_wrapped(head)}\n\n{proposed}"]
 
 
 def _readings_of(campaign: Campaign, unit: str) -> dict[str, Reading]:
@@ -455,6 +481,22 @@ def _layouts(reading: Reading, code: str) -> list[UnknownLog]:
         except IngestError as none:
             print(f"{file}: {none.message}\n")
     return layouts
+
+
+def _print_shipped(files: Sequence[Path]) -> None:
+    """Print the shipped profiles of text logs that read files as readings with gravity."""
+    for name in sorted(file.stem for file in (CONFIGS / "ingest").glob("*.yaml")):
+        option = read_option("ingest", name)
+        if "defaults" in option or "${" in str(option):  # of messages, or of a table or sensor that nobody stated
+            continue
+        ingest = Ingest.model_validate({"name": name, **option})
+        try:
+            recordings = [Reading.alone(group, ingest, None).checked() for group in grouped(files, ingest)]
+        except PipelineError:
+            continue
+        if all(map(shows_gravity, recordings)):
+            use = f"check by --ingest {name}, or set ingest={name} in a campaign"
+            print(_wrapped(f"SHIPPED PROFILE: {name} reads {', '.join(map(str, files))}: {use}") + "\n")
 
 
 def _print_proposals(proposals: Sequence[Proposal], sensor_model: Sensor | None, save: Path | None) -> None:

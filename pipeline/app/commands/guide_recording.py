@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from imu_logs.profile import checks_of
-from pipeline.app.commands.readings import campaign_of, complete_rows, config_of_log, grouped, recordings_of_files
+from pipeline.app.commands.readings import campaign_of, complete_rows, config_of_log, recordings_of_files
 from pipeline.app.config.campaign import load_campaign
 from pipeline.app.planning.guide import (
     MAX_PLANNED_RESTS,
@@ -29,7 +29,7 @@ from pipeline.core.errors import CannotCalibrateError, ConfigurationError, Pipel
 from pipeline.core.records import NotCalibrated
 from pipeline.core.settings import RecordingFile
 from pipeline.estimation.rest_means import is_multi_position
-from pipeline.ingest.files import recording_files
+from pipeline.ingest.files import grouped, recording_files
 from pipeline.ingest.read import read_table, to_recording
 from pipeline.physics.signal.rests import WINDOW_S, find_rests
 from pipeline.unit import Task, UnitFiles, UnitState, run_steps

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
 from typing import TYPE_CHECKING, Literal
 
-from imu_logs.files import SUFFIXES, ZIP, is_message_log
+from imu_logs.files import ZIP, is_message_log
 from imu_logs.profile import checks_of
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.options import SettingProblem, nearest
@@ -18,7 +17,7 @@ from pipeline.checks.checks import check_recordings
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
 from pipeline.core.settings import RecordingFile, Settings
-from pipeline.ingest.files import FILE, candidate_files, parts_of
+from pipeline.ingest.files import candidate_files
 from pipeline.ingest.read import read_table, to_recording
 from pipeline.simulation.description import shipped_settings
 
@@ -81,23 +80,6 @@ class Reading:
         """Return the recording after the checks of a single recording; without a sensor, by those of ``generic``."""
         generic = {} if self.sensor_model else {"sensor": shipped_settings(sensor="generic").sensor}
         return check_recordings([self.recording()], self.settings.replaced(**generic))[0]
-
-
-def grouped(files: Sequence[Path], ingest: Ingest) -> list[list[Path]]:
-    """Return the files of each recording: one, or one for each part of the profile."""
-    parts, of_messages = [part["file"] for part in parts_of(ingest)], bool(ingest.mcap.get("parts"))
-    groups: dict[Path, list[Path]] = {}
-    for file in files:
-        if not parts or (file.suffix.lower() in SUFFIXES[1:] and not of_messages):
-            groups[file] = [file]
-            continue
-        patterns = [re.escape(p).replace(re.escape(FILE), "(.+)") for p in parts]
-        match = next((m for p in patterns if (m := re.fullmatch(p, file.name))), None)
-        if match is None:
-            raise ConfigurationError(f"matches none of the profile's parts ({', '.join(parts)})", str(file))
-        stem = match.group(1) if match.groups() else ""
-        groups[file.parent / stem] = [file.parent / p.replace(FILE, stem) for p in parts]
-    return list(groups.values())
 
 
 def absolute(file: Path) -> Path:

@@ -18,6 +18,7 @@ body changes by ``du/dt = -omega x u``. Of the 48 maps P of axes and signs, the 
 
 from __future__ import annotations
 
+import re
 import textwrap
 from contextlib import suppress
 from itertools import islice, permutations, product
@@ -32,7 +33,7 @@ from imu_logs.message_decoder import ARRAYS, KINDS, object_decoder, ros_layouts
 from imu_logs.message_layout import short_name
 from imu_logs.message_logs import open_reader
 from imu_logs.message_read import LONGEST_ARRAY
-from imu_logs.profile import checks_of
+from imu_logs.profile import checks_of, csv_formats
 from imu_logs.units import DEGREES, TRIADS
 from pipeline.app.profile_detection.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.checks.bench import other_axes
@@ -40,8 +41,9 @@ from pipeline.core.errors import IngestError
 from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Recording, median
 from pipeline.core.settings import RecordingFile
 from pipeline.ingest.axis_maps import FAILS_DEG, FITS_DEG, misfit_deg, moves_of, rests_of
+from pipeline.ingest.files import FILE, grouped, parts_of
 from pipeline.ingest.quality_flags import CLIPPED, GAP, REST_LIMITS, STUCK, equal_share
-from pipeline.ingest.read import read_table, to_recording
+from pipeline.ingest.read import read_attitudes, read_table, to_recording
 from pipeline.physics.signal.rests import SHORTEST_REST_S, find_rests, rests_from_table, runs
 from pipeline.physics.signal.segments import MAX_AXIS_SINE
 
@@ -53,7 +55,7 @@ if TYPE_CHECKING:
 
     from imu_logs.log import Values
     from pipeline.core.records import Note
-    from pipeline.core.settings import Sensor, Settings
+    from pipeline.core.settings import Ingest, Sensor, Settings
     from pipeline.ingest.axis_maps import MoveByHand
     from pipeline.physics.signal.rests import Rest
 
@@ -78,6 +80,9 @@ WHOLE, ROUND_DEG = 0.05, 1.0  # relative: a scale factor error of 3 %, and a han
 SMOOTHED_S = 0.2
 CLEARER = 0.25  # of the sum of squares, below which another map of axes is proposed
 NO_RATE = np.zeros(3)
+GRAVITY_WITHIN = 0.2  # g, at rest: consumer sensors have biases of 0.1 g; another unit is wrong by more
+TEXT = ".txt"  # a text log, where the profile describes it
+OF_PARTS = "log"  # in a sheet, the name of the only recording, where the parts of the profile have fixed names
 
 
 def facts(recording: Recording, sensor: Sensor | None = None) -> list[Line]:
@@ -96,6 +101,13 @@ def facts(recording: Recording, sensor: Sensor | None = None) -> list[Line]:
     lines += _units(recording, rests)
     lines += [("notes" if i == 0 else "", text) for i, text in enumerate(_notes(recording.notes))]
     return lines
+
+
+def shows_gravity(recording: Recording) -> bool:
+    """Return whether the accelerometer's readings at rest have the size of gravity, as a fitting profile gives."""
+    force, rests = recording.accelerometer, _rests(recording)
+    sizes = [] if force is None else [np.linalg.norm(force[a:b].mean(axis=0)) for a, b in rests]
+    return bool(sizes) and abs(float(np.median(sizes)) - 1.0) < GRAVITY_WITHIN
 
 
 def as_text(lines: Sequence[Line]) -> str:
@@ -381,19 +393,21 @@ def _numbers(value: Any, path: str) -> Iterator[str]:  # noqa: ANN401  (a messag
 
 def proposed_sheet(folder: Path, settings: Settings) -> str:
     """Return the proposed sheet of a folder, with remarks; empty without a file."""
-    sheet, remarks, found, rows = settings.procedure.sheet or "", [], list[Recording](), []
-    files = [f for f in sorted(folder.glob("*")) if f.suffix in SUFFIXES and f.name != sheet and f.is_file()]
-    for path in files:
-        entry = RecordingFile(file=path.name, role="rests", axis=None, optional=False)
+    sheet, remarks, found, rows = settings.procedure.sheet or "", list[str](), list[Recording](), list[str]()
+    groups = _logs_in(folder, settings.ingest, sheet)
+    for name, paths in groups.items():
+        entry = RecordingFile(file=name, role="rests", axis=None, optional=False)
         try:
             checks = checks_of(settings.ingest)
-            table = read_table([path], settings.ingest)
-            found.append(to_recording(path.name, entry, table, settings.sensor, checks))
+            table = read_table(paths, settings.ingest)
+            found.append(to_recording(name, entry, table, settings.sensor, checks))
         except IngestError as error:
             if "time" in error.message and error.code == "missing_column":
-                rows.append(f"{path.name},attitudes")
-            else:
-                remarks.append(f"# {path.name} cannot be read: {error.message.splitlines()[0]}")
+                with suppress(IngestError):
+                    read_attitudes(paths[0], csv_formats(settings.ingest), settings.sensor, checks)
+                    rows.append(f"{name},attitudes")
+                    continue
+            remarks.append(f"# {name} cannot be read: {error.message.splitlines()[0]}")
     still = [r for r in found if _is_still(r) and r.gyroscope is not None]
     bias = median(np.array([np.asarray(r.gyroscope).mean(axis=0) for r in still])) if still else NO_RATE
     rows += [_of_table(recording, bias, settings.table.sense) or _row(recording, bias) for recording in found]
@@ -403,7 +417,24 @@ def proposed_sheet(folder: Path, settings: Settings) -> str:
             f"# gravity and turns agree with sensor.gyroscope.axis_map=[{', '.join(wrong)}], not the given one"
         )
     lines = ["file,kind,axis,angle_deg,angle_accuracy_deg,held_out", *sorted(rows), *remarks]
-    return "\n".join(lines) if files else ""
+    return "\n".join(lines) if groups else ""
+
+
+def has_rows(sheet: str) -> bool:
+    """Return whether a proposed sheet has a row."""
+    return any(not line.startswith("#") for line in sheet.splitlines()[1:])
+
+
+def _logs_in(folder: Path, ingest: Ingest, sheet: str) -> dict[str, list[Path]]:
+    """Return the logs of a folder by what a sheet calls them: a file, or the name that the parts of a log share."""
+    patterns = [re.compile(re.escape(p["file"]).replace(re.escape(FILE), ".+")) for p in parts_of(ingest)]
+    files = [f for f in sorted(folder.glob("*")) if f.is_file() and f.name != sheet]
+    parts = [f for f in files if any(pattern.fullmatch(f.name) for pattern in patterns)]
+    logs = {f.name: [f] for f in files if f.suffix in (*SUFFIXES, TEXT) and f not in parts}
+    for group in grouped(parts, ingest):
+        fixed = parts_of(ingest)[0]["file"]
+        logs[group[0].name.removesuffix(fixed.replace(FILE, "")) or OF_PARTS] = group
+    return logs
 
 
 def _accepted(recording: Recording) -> list[Rest]:
