@@ -81,7 +81,7 @@ SMOOTHED_S = 0.2
 CLEARER = 0.25  # of the sum of squares, below which another map of axes is proposed
 NO_RATE = np.zeros(3)
 GRAVITY_WITHIN = 0.2  # g, at rest: consumer sensors have biases of 0.1 g; another unit is wrong by more
-TEXT = ".txt"  # a text log, where the profile describes it
+TEXT_SUFFIX = ".txt"  # a text log, where the profile describes it
 OF_PARTS = "log"  # in a sheet, the name of the only recording, where the parts of the profile have fixed names
 
 
@@ -430,7 +430,7 @@ def _logs_in(folder: Path, ingest: Ingest, sheet: str) -> dict[str, list[Path]]:
     patterns = [re.compile(re.escape(p["file"]).replace(re.escape(FILE), ".+")) for p in parts_of(ingest)]
     files = [f for f in sorted(folder.glob("*")) if f.is_file() and f.name != sheet]
     parts = [f for f in files if any(pattern.fullmatch(f.name) for pattern in patterns)]
-    logs = {f.name: [f] for f in files if f.suffix in (*SUFFIXES, TEXT) and f not in parts}
+    logs = {f.name: [f] for f in files if f.suffix in (*SUFFIXES, TEXT_SUFFIX) and f not in parts}
     for group in grouped(parts, ingest):
         fixed = parts_of(ingest)[0]["file"]
         logs[group[0].name.removesuffix(fixed.replace(FILE, "")) or OF_PARTS] = group
