@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 ROLE, HELD_OUT = "rests", "validation"
 SOAK, ATTITUDES = "soak", "attitudes"  # kinds of recordings in the sheet; times of attitudes do not count
+BY_HAND = ("", "moves")  # kinds with rests and moves by hand, of which some are held out; "": without a sheet
 OF_ALL = ("clock_shared", "kinds", "swings")  # fields of ``Rests`` that are no arrays
 
 
@@ -60,19 +61,19 @@ def holdout_interval(recordings: Sequence[Recording], procedure: Procedure) -> i
 
 
 def count_of_rests(recordings: Sequence[Recording]) -> int:
-    """Return the number of accepted rests in the recordings of role ``rests``."""
-    return sum(len(split_rests(recording, 0).used) for recording in recordings if recording.role == ROLE)
+    """Return the number of accepted rests in the recordings of role ``rests``; with a sheet, in those of moves."""
+    return sum(len(split_rests(r, 0).used) for r in recordings if r.role == ROLE and r.kind in BY_HAND)
 
 
 def split_rests(recording: Recording, every: int) -> RestSplit:
     """Find the rests of a recording, by the table's log or else by its readings, and hold out some.
 
     ``every``: the middle one of so many accepted rests is held out, so that the first and the last rest are in the fit;
-    0 holds out none.
+    0 holds out none. A sheet's recordings of other kinds than moves are used whole.
     """
     rests = rests_from_table(recording) or find_rests(recording)
     accepted = [rest for rest in rests if rest.accepted]
-    held = range(every // 2, len(accepted), every) if every else range(0)
+    held = range(every // 2, len(accepted), every) if every and recording.kind in BY_HAND else range(0)
     return RestSplit(
         used=tuple(rest for i, rest in enumerate(accepted) if i not in held),
         held_out=tuple(accepted[i] for i in held),

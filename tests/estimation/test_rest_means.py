@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from unit_settings import settings_of
@@ -75,3 +77,15 @@ def test_a_table_log_takes_the_place_of_the_search() -> None:
     rate = np.where(np.arange(100) % 25 < 20, 0.0, 3.0)
     recording = Recording("r", "rests", "x", np.arange(100) * 100_000_000, np.zeros((100, 3)), table_rate=rate)
     assert [(r.start, r.stop) for r in split_rests(recording, 0).used] == [(0, 20), (28, 45), (53, 70), (78, 95)]
+
+
+def test_with_a_sheet_rests_of_moves_are_held_out_as_in_multi_position_and_those_of_other_kinds_are_not() -> None:
+    procedure = settings_of(procedure="listed").procedure
+    by_hand = settings_of(procedure="multi_position").procedure
+    moves, turn = (replace(_steps(15), name=kind, kind=kind) for kind in ("moves", "turn"))
+    held = held_out_rests([moves, turn], procedure)
+    assert held["turn"] == []
+    assert held["moves"] == held_out_rests([_steps(15)], by_hand)["recording"]
+    assert len(held["moves"]) == 5
+    assert held_out_rests([replace(_steps(14), kind="moves"), turn], procedure) == {}
+    assert held_out_rests([moves, replace(turn, role="validation")], procedure) == {}
