@@ -165,7 +165,7 @@ def test_config_says_where_an_unknown_unit_or_a_refused_override_stands(
 ) -> None:
     assert main(["config", "U7", "--campaign", str(fleet)]) == 2
     assert "no unit 'U7'; nearest: U6; valid: U1" in capsys.readouterr().err
-    assert main(["config", "U1", "filter.order=x", "--campaign", str(fleet)]) == 2
+    assert main(["config", "U1", "--campaign", str(fleet), "filter.order=x"]) == 2  # an option may stand before
     assert 'unit U1: filter.order="x": input should be a valid integer' in capsys.readouterr().err
 
 

@@ -246,7 +246,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--missing", nargs="?", const="", metavar="EFFECT", help=words)
     words = "write the formulas that the last run suggests for the unit to effects/, and add them"
     parser.add_argument("--suggested", action="store_true", help=words)
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_intermixed_args(argv)
     _require_own_results(arguments, reads=arguments.suggested or arguments.missing is not None)
     if not arguments.suggested:
         return _change(arguments)
@@ -261,7 +261,7 @@ def main(argv: Sequence[str]) -> int:
 
 def remove(argv: Sequence[str]) -> int:
     """Remove effects from <campaign>/devices/<unit>.yaml, and run the campaign: undoes add."""
-    arguments = _parser("remove", remove.__doc__).parse_args(argv)
+    arguments = _parser("remove", remove.__doc__).parse_intermixed_args(argv)
     _require_own_results(arguments, reads=False)
     return _change(arguments, undo=True)
 

@@ -123,7 +123,7 @@ class SavedProfiles:
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline check FILE...``."""
-    arguments = _parser().parse_args(argv)
+    arguments = _parser().parse_intermixed_args(argv)
     if arguments.save and arguments.save.suffix != ".yaml":
         raise ConfigurationError(f"--save {arguments.save}: the name of a profile's file ends in .yaml")
     tasks = _tasks(arguments)

@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument(
         "--python-effect", action="append", default=[], metavar="FILE", help="file of an effect in Python, as in a run"
     )
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_intermixed_args(argv)
     directory, unit = find_campaign(arguments.campaign), arguments.unit
     composer, all_layers = read_layers(directory, {"overrides": arguments.overrides, PYTHON: arguments.python_effect})
     if unit not in all_layers.units_table.rows:

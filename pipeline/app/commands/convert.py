@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     add("target", type=Path, metavar="OUT", help="the file to write")
     add("--from", dest="source_format", metavar="FORMAT", help="format of IN, if name and content are ambiguous")
     add("--to", dest="target_format", metavar="FORMAT", help="format of OUT, if it differs from the name")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_intermixed_args(argv)
     imported = read_any(arguments.source, arguments.source_format, counts_of(sensor_figures(arguments.sensor)))
     sheets = sensor_figures(arguments.sensor, imported)
     format_name = format_of(arguments.target.name if arguments.target_format is None else arguments.target_format)

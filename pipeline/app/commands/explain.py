@@ -73,7 +73,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--from", dest="format", metavar="FORMAT", help=words)
     parser.add_argument("--all", action="store_true", help="every unit of the campaign, and every unit of a problem")
     parser.add_argument("--limits", action="store_true", help="with the upper limits of effects that were not selected")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_intermixed_args(argv)
     file = Path(arguments.campaign)
     if is_published(file) and not _is_diagnosis(_json(file)):
         counts = counts_of(sensor_figures(arguments.sensor))

@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     parser = parser_of("unpack", __doc__, EPILOG, ("--results",))
     parser.add_argument("campaign", metavar="C", type=Path, help="a campaign, or its results")
     parser.add_argument("units", metavar="UNIT", nargs="+", help="units whose files are published")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_intermixed_args(argv)
     campaign, units = arguments.campaign, arguments.units
     results = campaign if (campaign / "summary.csv").is_file() else _results_of(campaign, Path(arguments.results))
     if not any((results / PACKS).glob("*/*")):
