@@ -20,6 +20,7 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / name) for name in ("imu_logs",
 import bad_logs  # noqa: E402
 import bad_units  # noqa: E402
 
+from pipeline.core.verdicts import KINDS, Verdict  # noqa: E402
 from pipeline.output.exports import Format, formats  # noqa: E402
 
 PLACE = re.compile(r"(<!-- (\w+): tests/document_tables\.py -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -106,7 +107,14 @@ def sensors() -> str:
     return "\n".join(textwrap.wrap(", ".join(names), 120)) + "\n"
 
 
-TABLES = {"bad_inputs": bad_inputs, "exports": exports, "sensors": sensors}
+def states() -> str:
+    """Return a row for each state of a unit, the most urgent first."""
+    verdicts = {*Verdict}
+    rows = [[f"{k.name} (`{kind}`)" if kind in verdicts else k.name, k.meaning] for kind, k in KINDS.items()]
+    return table(["state", "meaning"], rows)
+
+
+TABLES = {"bad_inputs": bad_inputs, "exports": exports, "sensors": sensors, "states": states}
 
 
 def with_tables(text: str) -> str:

@@ -102,7 +102,9 @@ KINDS = {  # the most urgent first
         "calibrate with a method that fits the full matrix (method=reference_least_squares)",
     ),
     FAR: Kind(
-        "far above noise", "the uncertainty of the calibration explains the error, but does not show that it is good",
+        "far above noise",
+        f"the held-out error is above {MARK_ABOVE_FLOORS:g} x noise, or the angle after held-out moves above "
+        f"{MARK_AFTER_MOVES:g} x; the uncertainty of the calibration explains it, but does not show that it is good",
         "record more",
     ),
     Verdict.NOT_ENOUGH_DATA: Kind(
@@ -242,6 +244,18 @@ def _far_after_moves(row: Mapping[str, Any], sensor: str) -> str:
     """Return the angle after held-out moves by hand in words if a unit is marked for it; else an empty text."""
     over = _number(row.get(f"{sensor}_moves_over_noise")) or 0.0
     return decided_words("angle", over) if over > MARK_AFTER_MOVES else ""
+
+
+def far_by_moves(state: RowState, sensor: str) -> str:
+    """Return the angle after held-out moves in words, where it alone makes a sensor far above noise."""
+    near = (state.errors[sensor].ratio or 0.0) <= MARK_ABOVE_FLOORS
+    return _far_after_moves(state.row, sensor) if near and sensor in state.kinds.get(FAR, []) else ""
+
+
+def largest_over_noise(state: RowState) -> float | None:
+    """Return the largest error over noise of a unit: of its sensors, and of the angle after held-out moves."""
+    figures = [(state.errors[s].ratio, _number(state.row.get(f"{s}_moves_over_noise"))) for s in SENSORS]
+    return max((figure for pair in figures for figure in pair if figure), default=None)
 
 
 def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False) -> list[Problem]:

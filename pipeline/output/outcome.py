@@ -17,7 +17,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from imu_logs.units import SENSORS
 from pipeline.core.errors import shortened
 from pipeline.core.files import INSTALLED, JSON, read_json, text_of_cell
-from pipeline.core.verdicts import FAILED, KINDS, READY, SETTING, WITH_THEM, Verdict, decided_words, problems, state_of
+from pipeline.core.verdicts import (
+    FAILED,
+    KINDS,
+    READY,
+    SETTING,
+    WITH_THEM,
+    Verdict,
+    decided_words,
+    largest_over_noise,
+    problems,
+    state_of,
+)
 from pipeline.output.history import difference, dropped, errors_of, of_units, read_history
 
 if TYPE_CHECKING:
@@ -114,7 +125,7 @@ def all_well(rows: Sequence[Mapping[str, Any] | RowState]) -> str:
     states = [*map(state_of, rows)]
     if not states or any(state.kinds for state in states):
         return ""
-    ratios = [error.ratio for state in states for error in state.errors.values() if error.ratio]
+    ratios = [ratio for state in states if (ratio := largest_over_noise(state))]
     error = f", and the held-out error is at most {max(ratios):.3g} x noise" if ratios else ""
     who = f"All {len(rows)} units are" if len(rows) > 1 else "The unit is"
     return f"{who} ready: nothing that the recordings can show is missing{error}."

@@ -16,7 +16,7 @@ from pipeline.evaluation import diagnosis as diagnosis_package
 from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.output import pages as report_package
 from pipeline.output.history import errors_of, of_units, record, unit_state
-from pipeline.output.outcome import changes_of, counted, problem_words
+from pipeline.output.outcome import all_well, changes_of, counted, problem_words
 from pipeline.output.pages import campaign_page
 from pipeline.output.pages.certificate import model_state
 from pipeline.output.pages.chart import Figure
@@ -196,6 +196,22 @@ def test_a_campaign_whose_units_are_ready_says_so() -> None:
     row |= {"accelerometer_error_after": 0.0103, "accelerometer_noise_floor": 0.01}
     said = "All 2 units are ready: nothing that the recordings can show is missing, and the held-out error is"
     assert f"{said} at most 1.03 × noise." in Text(campaign_page.render("bench", [row, row | {"unit": "U2"}], [])).text
+    moved = row | {"unit": "U2", "gyroscope_verdict": "nothing_missing", "gyroscope_moves_over_noise": 1.71}
+    assert all_well([row, moved]) == f"{said} at most 1.71 x noise."
+    assert f"{said} at most 1.71 × noise." in Text(campaign_page.render("bench", [row, moved], [])).text
+
+
+def test_a_unit_far_above_noise_by_its_moves_is_said_to_be_so_in_one_way() -> None:
+    row = {"unit": "U1", "serial": "S", "status": "ok", "gyroscope_verdict": "nothing_missing"}
+    row |= {"gyroscope_error_before": 1.0, "gyroscope_error_after": 0.0131, "gyroscope_noise_floor": 0.01}
+    page = campaign_page.render("bench", [row | {"gyroscope_moves_over_noise": 12.9}], [])
+    text = Text(page).text
+    assert "Gyroscope: 1 of 1 units far above noise; angle after held-out moves, 12.9 × noise in U1" in text
+    assert "above 3 × noise;" not in text
+    for far, shown in ((True, page), (False, campaign_page.render("bench", [row], []))):
+        (of_unit,) = re.findall(r'<tr><th scope="row">[^\n]*U1.*?</tr>', shown.partition('id="all"')[2], re.DOTALL)
+        assert ("nothing missing" in of_unit, "good-text" in of_unit) == (not far, not far)
+        assert of_unit.count("far above noise") == 2 * far  # state, and verdict of the gyroscope
 
 
 def test_every_problem_has_a_next_step_and_a_command(known: Unit) -> None:

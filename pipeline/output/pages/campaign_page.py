@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Values
-from pipeline.core.verdicts import KINDS, MARK_ABOVE_FLOORS, Verdict, problems, state_of
+from pipeline.core.verdicts import FAR, KINDS, MARK_ABOVE_FLOORS, Verdict, far_by_moves, problems, state_of
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.outcome import all_well, beyond_limits_groups, command_of, counts_of, explain_command, ratio_words
 from pipeline.output.pages.chart import Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
@@ -157,9 +157,13 @@ def overview_chart(sensor: str, rows: Sequence[JSON | RowState]) -> UnitChart | 
     ratio = np.array([errors[i].ratio for i in known], float)
     ready = np.array([not any(sensor in of for of in states[i].kinds.values()) for i in known])
     worst, far = names_of[known[0]], int(np.count_nonzero(ratio > MARK_ABOVE_FLOORS))
+    moved = [(words, n) for s, n in zip(states, names_of, strict=True) if (words := far_by_moves(s, sensor))]
     middle = f", median {number(float(np.median(ratio)))} ×" if len(known) > 1 else ""
     finding = f"{sensor.capitalize()}: {far} of {len(known)} units above {MARK_ABOVE_FLOORS:g} × noise"
     finding += f"; {number(float(ratio[0]))} × in {worst}" if far else f"; at most {number(float(ratio[0]))} ×"
+    if moved and not far:
+        of = f"{len(moved)} of {len(known)} units {KINDS[FAR].name}"
+        finding = typeset(f"{sensor.capitalize()}: {of}; {moved[0][0]} in {moved[0][1]}")
     kind = "vector" if all(errors[i].kind == "vector" for i in known) else "magnitude"
     caption = f"Error of the {kind} on held-out motion, over the error that noise alone gives; lines: 1 × and 3 ×."
     description, label = f"{finding}{middle}.", "error over noise floor (logarithmic)"
