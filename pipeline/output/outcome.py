@@ -12,6 +12,7 @@ import math
 import re
 import shlex
 from collections import Counter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from imu_logs.units import SENSORS
@@ -33,7 +34,6 @@ from pipeline.output.history import difference, dropped, errors_of, of_units, re
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
 
     from pipeline.core.verdicts import Problem, RowState
 
@@ -334,11 +334,11 @@ def uncertainty_words(before: JSON, after: JSON, unit: str) -> str:
 
 
 def run_command(settings: Mapping[str, Any]) -> str:
-    """Return the command of a run: ``snakemake`` in a clone, ``imu-calibration run`` if the wheel is installed.
+    """Return the command of a run: ``snakemake`` where its rules are, else ``run`` of this package.
 
     ``settings``: those of ``--config``: ``campaign``, ``overrides``, ``unit_overrides``, ``results`` ...
     """
-    if INSTALLED:
+    if not Path("Snakefile").is_file():
         return _command("run", settings, [], str(settings.get("results") or DEFAULT_RESULTS))
     return shlex.join(["snakemake", "--cores", "2", *_config(settings)])
 

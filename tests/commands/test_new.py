@@ -35,6 +35,14 @@ def test_the_table_is_named_with_its_accuracy_and_other_ranges_are_set_as_the_co
     assert [sensor.gyroscope.full_scale, sensor.gyroscope.counts_per_unit] == [500, 65.5]
 
 
+def test_outside_a_clone_the_command_is_one_that_runs_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", "--sensor", "mpu6050"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "then: python -m pipeline run bench"
+
+
 def test_without_a_choice_the_table_of_the_procedure_is_written_down(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

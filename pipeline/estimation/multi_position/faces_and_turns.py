@@ -165,8 +165,9 @@ def _of_row(  # noqa: PLR0917  (what a row states)
     stated = entry.angle_deg or turns.angle_deg * round(float(angle @ direction) / turns.angle_deg)
     by = f"by {entry.angle_deg:g} deg" if entry.angle_deg else f"by whole turns of {turns.angle_deg:g} deg"
     axis = int(np.argmax(np.abs(angle)))
-    nearest = turns.angle_deg * round(float(angle[axis]) / turns.angle_deg) or float(np.round(angle[axis]))
-    agrees = np.copysign(entry.angle_deg, angle[axis]) if entry.angle_deg else nearest
+    seen, whole = float(angle[axis]), turns.angle_deg * round(float(angle[axis]) / turns.angle_deg)
+    possible = (np.copysign(entry.angle_deg or 0.0, seen), whole, np.round(seen))
+    agrees = next((p for p in possible if abs(seen - p) < SCALE * abs(p)), seen)
     _require_turned(recording, angle, direction, stated, by, f" and angle_deg {agrees:g}")
     error = entry.angle_accuracy_deg or turns.accuracy_deg
     return StatedTurn(index, span, direction, stated, error, turns.axis_accuracy_deg)

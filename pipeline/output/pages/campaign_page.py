@@ -162,8 +162,8 @@ def overview_chart(sensor: str, rows: Sequence[JSON | RowState]) -> UnitChart | 
     finding = f"{sensor.capitalize()}: {far} of {len(known)} units above {MARK_ABOVE_FLOORS:g} × noise"
     finding += f"; {number(float(ratio[0]))} × in {worst}" if far else f"; at most {number(float(ratio[0]))} ×"
     if moved and not far:
-        of = f"{len(moved)} of {len(known)} units {KINDS[FAR].name}"
-        finding = typeset(f"{sensor.capitalize()}: {of}; {moved[0][0]} in {moved[0][1]}")
+        count = f"{len(moved)} of {len(known)} units {KINDS[FAR].name}"
+        finding = typeset(f"{sensor.capitalize()}: {count}; {moved[0][0]} in {moved[0][1]}")
     kind = "vector" if all(errors[i].kind == "vector" for i in known) else "magnitude"
     caption = f"Error of the {kind} on held-out motion, over the error that noise alone gives; lines: 1 × and 3 ×."
     description, label = f"{finding}{middle}.", "error over noise floor (logarithmic)"

@@ -171,6 +171,14 @@ def test_a_turn_in_the_other_sense_is_refused_with_the_angle_that_agrees(tmp_pat
         calibrated(tmp_path)
 
 
+def test_a_turn_by_another_angle_is_refused_with_the_angle_that_it_shows(tmp_path: Path) -> None:
+    with_three_turns(tmp_path, angle=90.0)
+    sheet = tmp_path / "recordings.csv"
+    sheet.write_text(sheet.read_text().replace("turn,y,90", "turn,y,180"))
+    with pytest.raises(Exception, match=r"turn_y is no turn about y by 180 deg.*angle_deg (8\d|9\d) would agree"):
+        calibrated(tmp_path)
+
+
 def test_cholesky_and_lu_work_on_turns_by_known_angles(tmp_path: Path) -> None:
     unit = with_three_turns(tmp_path)
     result = pipeline.calibrate(
