@@ -99,13 +99,15 @@ def script_of(words: list[str]) -> Path:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: file.name)
 def test_the_options_of_commands_exist(document: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    parse = argparse.ArgumentParser.parse_args
+    def accepting(parse: Any) -> Any:
+        def parsed(*arguments: Any, **keywords: Any) -> None:
+            parse(*arguments, **keywords)
+            raise Parsed
 
-    def parsed(*arguments: Any, **keywords: Any) -> None:
-        parse(*arguments, **keywords)
-        raise Parsed
+        return parsed
 
-    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parsed)
+    for name in ("parse_args", "parse_intermixed_args"):
+        monkeypatch.setattr(argparse.ArgumentParser, name, accepting(getattr(argparse.ArgumentParser, name)))
     for command in commands(document, inline=True):
         words = ["3" if word == "N" else word for word in shlex.split(command.removeprefix("nice "))]
         if words[:3] == ["python", "-m", "pipeline"] or words[0] == "imu-calibration":

@@ -373,7 +373,7 @@ def not_determined(part: Mapping[str, Any]) -> str:
             "by 90 and -90 deg about each axis with gravity across it"
         )
         return f"the recordings do not determine {names} better than the limit of the sensor file: {', or '.join(ways)}"
-    return f"the rests do not determine {names}, known by the limit of the sensor file alone: {advice}"
+    return f"the rests do not determine {names} better than the limit of the sensor file: {advice}"
 
 
 def left_out(inputs: Sequence[Mapping[str, Any]] | None) -> list[str]:

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 
+from imu_logs.profile import checks_of
 from pipeline.app.config.compose import Composer
-from pipeline.app.profile_detection.recording_facts import proposed_sheet
-from tests.study.listed_recordings import Unit, at_rest, joined, on_table, turned
+from pipeline.app.profile_detection.recording_facts import (
+    SUITS_FERRARIS,
+    facts,
+    proposed_sheet,
+    rests_in_short,
+    suits_ferraris,
+)
+from pipeline.core.settings import RecordingFile
+from pipeline.ingest.arrow import write_recording
+from pipeline.ingest.read import read_table, to_recording
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription
+from tests.study.listed_recordings import Unit, at_rest, joined, on_table, rotation, turned
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -57,3 +71,41 @@ def test_reversed_and_exchanged_axes_of_the_gyroscope_are_found_from_gravity(tmp
     assert any("axis_map=[-x, +y, +z]" in row for row in recorded(tmp_path / "U1", reversed_x))
     exchanged = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     assert any("axis_map=[+y, +x, +z]" in row for row in recorded(tmp_path / "U2", exchanged))
+
+
+def test_of_six_faces_and_turns_in_one_file_the_procedure_that_determines_more_is_named(tmp_path: Path) -> None:
+    recordings, _ = simulate_unit(UnitDescription("U", table="hand", procedure="ferraris"), 7, 0)
+    write_recording(tmp_path / "all.csv", recordings[0])
+    settings = Composer(tmp_path).unit("unit", ["sensor=mpu6050", "procedure=listed"])
+    assert proposed_sheet(tmp_path, settings).splitlines()[1:] == ["all.csv,moves", f"# all.csv: {SUITS_FERRARIS}"]
+    assert not suits_ferraris(simulate_unit(UnitDescription("U", table="hand", procedure="multi_position"), 7, 0)[0][0])
+
+
+def test_times_of_rests_are_those_of_windows(tmp_path: Path) -> None:
+    unit, axis = Unit(tmp_path, np.random.default_rng(3)), np.eye(3)[0]
+    parts = joined(
+        at_rest(6.0, UP), turned(90.0, 90.0, axis, UP), at_rest(5.0, rotation(axis, np.array([-np.pi / 2.0]))[0] @ UP)
+    )
+    unit.write("moved", "moves,,,,", *parts)
+    settings = Composer(tmp_path).unit("unit", ["sensor=mpu6050", "procedure=listed"])
+    entry = RecordingFile(file="moved.csv", role="rests", axis=None, optional=False)
+    read = to_recording(
+        "moved",
+        entry,
+        read_table([tmp_path / "moved.csv"], settings.ingest),
+        settings.sensor,
+        checks_of(settings.ingest),
+    )
+    (words,) = [text for label, text in facts(read) if label == "rests"]
+    found = re.findall(r"([\d.]+) to ([\d.]+)", words.partition("from the start: ")[2])
+    assert np.array(found, float) == pytest.approx(
+        np.array([[0.0, 6.0], [read.time[-1] - 5.0, read.time[-1]]]), abs=0.6
+    )
+    assert rests_in_short(read).startswith("moved: 2, the first at ")
+
+
+def test_what_is_said_not_to_have_moved_is_proposed_as_a_rest(tmp_path: Path) -> None:
+    unit = Unit(tmp_path, np.random.default_rng(3))
+    unit.write("still", "rest,,,,", *at_rest(4.0, UP))  # the edges of a rest, 0.5 s, are left out of it
+    settings = Composer(tmp_path).unit("unit", ["sensor=mpu6050", "procedure=listed"])
+    assert proposed_sheet(tmp_path, settings).splitlines()[1:] == ["still.csv,rest"]

@@ -21,12 +21,15 @@ from pipeline.app.config.campaign import find_campaign, load_campaign
 from pipeline.app.config.options import nearest
 from pipeline.app.one_unit import try_unit, unit_of_campaign
 from pipeline.app.profile_detection.recording_facts import (
+    SUITS_FERRARIS,
     as_text,
     counted,
     facts,
     has_rows,
     proposed_sheet,
+    rests_in_short,
     shows_gravity,
+    suits_ferraris,
     topic_lines,
 )
 from pipeline.app.profile_detection.unit_guesses import propose
@@ -35,6 +38,7 @@ from pipeline.core.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError
 from pipeline.core.files import CONFIGS, write_atomically
 from pipeline.core.records import SENSORS
 from pipeline.core.settings import Ingest, settings_of_ranges
+from pipeline.estimation.rest_means import BY_HAND
 from pipeline.ingest.files import FILE, grouped, recording_files
 from pipeline.output.outcome import NAMED_PER_LINE, as_overrides, found_mountings
 from pipeline.physics.statements import LEFT_OUT_REASONS
@@ -359,6 +363,9 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str], saved: Save
         document = trial.state.calibration or {}
         lines = [(sensor, f"null: {reason}") for sensor, reason in document["not_calibrated"].items()]
         lines += [(s, text) for s in SENSORS if document[s] and (text := document[s]["not_determined"])]
+        by_hand = [r for r in checked if r.role == "rests" and r.kind in BY_HAND and r.logged_rate is None]
+        lines += [("rests", text) for recording in by_hand if (text := rests_in_short(recording))]
+        lines += [("procedure", f"{r.name}: {SUITS_FERRARIS}") for r in by_hand if r.kind and suits_ferraris(r)]
         noted: dict[str, dict[tuple[str, str], list[str]]] = {}
         for recording in checked:
             for note in (n for n in recording.notes if not n.settings):

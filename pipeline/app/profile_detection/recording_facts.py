@@ -37,15 +37,17 @@ from imu_logs.profile import checks_of, csv_formats
 from imu_logs.units import DEGREES, TRIADS
 from pipeline.app.profile_detection.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.checks.bench import other_axes
-from pipeline.core.errors import IngestError
+from pipeline.core.errors import IngestError, shortened
 from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Recording, median
 from pipeline.core.settings import RecordingFile
+from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
 from pipeline.ingest.axis_maps import FAILS_DEG, FITS_DEG, misfit_deg, moves_of, rests_of
 from pipeline.ingest.files import FILE, grouped, parts_of
 from pipeline.ingest.quality_flags import CLIPPED, GAP, REST_LIMITS, STUCK, equal_share
 from pipeline.ingest.read import read_attitudes, read_table, to_recording
 from pipeline.physics.signal.rests import SHORTEST_REST_S, find_rests, rests_from_table, runs
-from pipeline.physics.signal.segments import MAX_AXIS_SINE
+from pipeline.physics.signal.segments import MAX_AXIS_SINE, turns_by_hand
+from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -70,9 +72,12 @@ LISTED_NOTES = 20  # fit one screen; the others are counted
 LONGEST_LIST = 4  # elements of an array that are listed
 MAX_LISTED_FIELDS = 24  # of a message that are listed
 MOST_TOPICS = 20  # with a line each
+MOST_RESTS = 60  # whose times are listed
 
 Line = tuple[str, str]
 RESTING_SHARE = 0.8  # share of a recording that lies still
+WHOLE_REST = 0.9  # share of a recording that is one rest, where the sensor did not move
+SUITS_FERRARIS = "six faces and turns about x, y and z in one file: procedure=ferraris determines more (docs/record.md)"
 SAME_ATTITUDE_DEG = 5.0
 SWEPT_DEGC = 10.0  # as of a sweep that validation shows
 MIN_PROPOSED_TURN_DEG = 45.0
@@ -208,15 +213,47 @@ def _describe_rests(recording: Recording, rests: Sequence[tuple[int, int]]) -> s
         return "none found"
     lengths = np.array([b - a for a, b in rests]) * recording.interval
     if len(rests) == 1:
-        whole = rests[0][1] - rests[0][0] > 0.9 * recording.samples
-        return f"1, of {_number(lengths[0], 3)} s" + (": the sensor did not move" if whole else "")
+        return f"1, of {_number(lengths[0], 3)} s" + ": the sensor did not move" * _did_not_move(recording, rests)
     text = f"{len(rests)}, {_number(lengths.min(), 2)} to {_number(lengths.max(), 3)} s long"
     short = int(np.count_nonzero(lengths < SHORTEST_REST_S))
     by_hand = recording.role == "rests" and not _turns(recording)
     return text + (
         f"; {short} of them are shorter than {SHORTEST_REST_S:g} s, and a run does not use them"
         * (by_hand and short > 0)
+        + f"; s from the start: {', '.join(shortened(times_of(recording, rests), MOST_RESTS))}" * by_hand
     )
+
+
+def times_of(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[str]:
+    """Return the times of rests from the start of a recording, s, as windows of a procedure state them."""
+    time = recording.time - recording.time[0]
+    return [f"{time[a]:.1f} to {time[b - 1]:.1f}" for a, b in rests]
+
+
+def rests_in_short(recording: Recording) -> str:
+    """Return the number of a recording's rests, and the times of the first and the last; empty for fewer than two."""
+    rests = [(r.start, r.stop) for r in _accepted(recording)]
+    first, *_, last = times_of(recording, rests) if len(rests) > 1 else ["", ""]
+    return (
+        f"{recording.name}: {len(rests)}, the first at {first} s, the last at {last} s; check FILE lists all"
+        if first
+        else ""
+    )
+
+
+def _did_not_move(recording: Recording, rests: Sequence[tuple[int, int]]) -> bool:
+    return len(rests) == 1 and rests[0][1] - rests[0][0] > WHOLE_REST * recording.samples
+
+
+def suits_ferraris(recording: Recording) -> bool:
+    """Return whether each face is up in a rest, and whole turns about each axis are between rests."""
+    force, found = recording.accelerometer, find_rests(recording)
+    means = [] if force is None else [force[r.start : r.stop].mean(axis=0) for r in found if r.accepted]
+    turns = shipped_settings(procedure="ferraris").procedure.turns
+    if len(means) < len(FACES) or turns is None:
+        return False
+    about = {turn.axis for turn in turns_by_hand(recording, found, turns)}
+    return {*range(len(FACES))} <= {*face_of(np.array(means))[0].tolist()} and len(about) == len(AXES)
 
 
 def _clipping(recording: Recording, sensor: Sensor | None) -> str:
@@ -411,6 +448,7 @@ def proposed_sheet(folder: Path, settings: Settings) -> str:
     still = [r for r in found if _is_still(r) and r.gyroscope is not None]
     bias = median(np.array([np.asarray(r.gyroscope).mean(axis=0) for r in still])) if still else NO_RATE
     rows += [_of_table(recording, bias, settings.table.sense) or _row(recording, bias) for recording in found]
+    remarks += [f"# {r.name}: {SUITS_FERRARIS}" for r in found if suits_ferraris(r)]
     wrong = _other_axes(found, bias)
     if wrong:
         remarks.append(
@@ -448,6 +486,8 @@ def _is_still(recording: Recording) -> bool:
         total = np.trapezoid(rate - median(rate), recording.time, axis=0)
         return bool(np.ptp(rate, axis=0).max() < 5.0 and np.abs(total).max() < SAME_ATTITUDE_DEG)
     rests = _accepted(recording)
+    if _did_not_move(recording, _rests(recording)):
+        return True
     u = [recording.accelerometer[r.start : r.stop].mean(axis=0) for r in rests]
     apart = [np.degrees(np.linalg.norm(v / np.linalg.norm(v) - u[0] / np.linalg.norm(u[0]))) for v in u]
     return sum(r.stop - r.start for r in rests) > RESTING_SHARE * recording.samples and max(apart) < SAME_ATTITUDE_DEG

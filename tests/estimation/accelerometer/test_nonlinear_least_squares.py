@@ -374,7 +374,7 @@ def test_six_positions_give_bias_and_scale_factors_and_the_limit_of_each_misalig
     for name in names:
         assert stage.parameters[name].standard_uncertainty == pytest.approx(U_OF_LIMIT, rel=0.02)
     assert (part["convergence"]["rank"], part["convergence"]["parameters"]) == (6, 9)
-    assert not_determined(part).startswith(f"the rests do not determine {', '.join(names)}, known by")
+    assert not_determined(part).startswith(f"the rests do not determine {', '.join(names)} better than")
     (line,) = (c for c in part["uncertainty_budget"]["contributions"] if c["type"] == "B")
     assert line["contribution"][3] > 1e-4  # of S_x, by the square of the misalignments: 0.016^2 / 2
     assert np.all(
