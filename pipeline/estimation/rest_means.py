@@ -262,8 +262,8 @@ def rests_of(
 ) -> Rests | None:
     """Return the rests of the recordings of a role, or None where there are none.
 
-    ``accelerometer``: rests that its method left out are left out here. ``role``: ``rests``, or ``validation``, whose
-    rests are all held out.
+    ``accelerometer``: rests that its method left out are left out here. ``role``: ``rests``, of which some may be held
+    out; ``static``; or ``validation``, whose rests are all held out.
     """
     every = holdout_interval(recordings, procedure) if role == ROLE else 0
     refused = {
@@ -284,6 +284,17 @@ def rests_of(
     found = gathered(sensor, recordings, chosen)
     keys = zip(found.recording.tolist(), found.span[:, 0].tolist(), strict=True)
     return replace(found, held_out=np.array([key in held for key in keys], bool)) if len(found.time) else None
+
+
+def readings_in(sensor: str, recordings: Sequence[Recording], rests: Rests) -> Values:
+    """Return the mean readings of a sensor in rests of the other one: (m, 3), NaN where it has none."""
+    found = np.full((len(rests.time), 3), np.nan)
+    for index in np.unique(rests.recording).tolist():
+        of_recording = rests.recording == index
+        means, _ = rest_means(recordings[index], [Rest(*ends) for ends in rests.span[of_recording].tolist()], sensor)
+        if len(means):
+            found[of_recording] = means
+    return found
 
 
 def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, Sequence[Rest]]) -> Rests:

@@ -31,6 +31,7 @@ from pipeline.core.records import (
     BASE_NAMES,
     LIMIT,
     NORMAL,
+    NOT_ESTIMATED,
     SENSORS,
     Contribution,
     Estimate,
@@ -50,7 +51,7 @@ from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
 from pipeline.estimation.multi_position.model import motion_at_rests
 from pipeline.estimation.noise import wander_prior
-from pipeline.estimation.rest_means import rests_of
+from pipeline.estimation.rest_means import readings_in, rests_of
 from pipeline.estimation.table_errors import type_b
 from pipeline.estimation.uncertainty_budget import (
     GRAVITY,
@@ -153,11 +154,12 @@ class StageOutput:
     ...     rests, g, bias = task.rests, task.settings.table.gravity_g, np.zeros(3)
     ...     for _ in range(10):  # Gauss-Newton
     ...         force = rests.reading - bias
-    ...         residual = np.sum(force**2, axis=1) - g**2
-    ...         bias = bias + np.linalg.lstsq(2.0 * force, residual)[0]
+    ...         length = np.linalg.norm(force, axis=1, keepdims=True)
+    ...         residual, direction = length[:, 0] - g, force / length
+    ...         bias = bias + np.linalg.lstsq(direction, residual)[0]
     ...     return StageOutput(
-    ...         estimated=BIAS_NAMES, bias=bias, rests=rests, residual=residual, jacobian=-2.0 * force,
-    ...         by_reading=2.0 * force, by_gravity=np.full(len(residual), -2.0 * g),
+    ...         estimated=BIAS_NAMES, bias=bias, rests=rests, residual=residual, jacobian=-direction,
+    ...         by_reading=direction, by_gravity=np.full(len(residual), -1.0),
     ...     )
     >>> found = fit(task).calibration(task)  # of a simulated unit with the bias 0.05, -0.02, 0.01 g
     >>> np.abs(found.bias - [0.05, -0.02, 0.01]) < found.parameters.expanded_uncertainty[:3]
@@ -170,7 +172,7 @@ class StageOutput:
     bias: Values  # (3,), g or deg/s
     matrix: Values | None = None  # (3, 3); None: that of the stage before
     rests: Rests
-    residual: Values  # (n,)
+    residual: Values  # (n,); g or deg/s, times a weight of mean square 1
     jacobian: Values  # (n, p), of the residuals with respect to the estimated elements
     by_reading: Values  # (n, 3), of the residuals with respect to the mean reading of their rest
     by_gravity: Values | None = None  # (n,), with respect to local gravity, where an equation contains it
@@ -199,7 +201,7 @@ class StageOutput:
             lines.append(Contribution("stages before", "A", "Student's t", covariance, freedom))
         if len(left := rest[known[rest] == 0.0]):
             by_limit = change[:, left] * limits_of_base(task.data_sheet)[left]
-            remark, freedom = ", ".join(BASE_NAMES[k] for k in left), np.full(BASE_COUNT, np.inf)
+            remark, freedom = NOT_ESTIMATED + ", ".join(BASE_NAMES[k] for k in left), np.full(BASE_COUNT, np.inf)
             lines.append(Contribution(LIMIT, "B", NORMAL, by_limit @ by_limit.T, freedom, remark=remark))
         u = task.settings.table.gravity_accuracy_g
         if self.by_gravity is not None and u:
@@ -262,13 +264,11 @@ class StageOutput:
 
     def _at_limits(self, task: StageInput, gain: Values, place: Index, matrix: Values) -> dict[str, Values]:
         """Return the change of bias and matrix by each effect at its limits: (12, p)."""
-        rests, found = self.rests, dict[str, Values]()
-        force = rests.reading @ matrix.T
+        rests, found, force = self.rests, dict[str, Values](), self.rests.reading @ matrix.T
         if task.sensor == "gyroscope":
-            of_force = rests_of("accelerometer", task.recordings.filtered, task.settings.procedure)
-            force = of_force.select(~of_force.held_out).reading if of_force is not None else np.zeros_like(force)
-            if len(force) != len(rests.time):  # other rests than those of the gyroscope
-                return {}
+            of_force = readings_in("accelerometer", task.recordings.filtered, rests)
+            # where the attitude is unknown, the most along each axis
+            force = np.where(np.isnan(of_force), task.settings.table.gravity_g, of_force)
         motion = centred([motion_at_rests(rests, force)])[0]
         K = np.asarray(np.linalg.solve(matrix, np.eye(3)))
         for this, start, limits in limited_effects(task.sensor, (), task.data_sheet):

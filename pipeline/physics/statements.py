@@ -45,6 +45,8 @@ from pipeline.core.records import (
     BASE_NAMES,
     BIAS_NAMES,
     LIMIT,
+    MATRIX_NAMES,
+    NOT_ESTIMATED,
     SENSOR_UNITS,
     FittedEffect,
     SensorCalibration,
@@ -67,6 +69,7 @@ DIFFERENT = 1.1  # ratio of both uncertainties above which pages, terminal and c
 NAMED_EFFECTS = 4  # in a sentence
 NEGLIGIBLE = 1e-3  # of U of every parameter: a change below it is not listed
 OF_BUDGET = {"time base": "clock_rate", "Earth's rotation": "earth_rotation"}  # source that is not included: its effect
+ESTIMATE_IT = "choose a method that estimates it, such as the default method"
 NOT_DIAGNOSED = "the diagnosis failed, so that it is not known what the recordings show"
 LEFT_OUT_REASONS = {
     "N-STUCK": "stuck",
@@ -355,6 +358,9 @@ def not_determined(part: Mapping[str, Any]) -> str:
     names = next((str(line["remark"]) for line in lines if line["source"] == LIMIT), "")
     if not names:
         return ""
+    if names.startswith(NOT_ESTIMATED):
+        kept = names.removeprefix(NOT_ESTIMATED).replace(", ".join(MATRIX_NAMES), "the matrix")
+        return f"the method does not estimate {kept}, known by the limit of the sensor file alone: {ESTIMATE_IT}"
     advice = "rest the unit in more attitudes, also half-way between two axes"
     if "bias_" in names or "scale_factor_" in names:
         advice = "rest the unit in more attitudes, each axis up and down, also half-way between two axes"

@@ -5,29 +5,36 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from bench_session import Session, record
+from hand_simulator import Hand
+from hand_simulator import draw as draw_hand
 
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import draw
 from pipeline.app.one_unit import unit_of_recordings
 from pipeline.core.records import (
+    BIAS_NAMES,
     Agreement,
     Dependence,
     MovesError,
     Note,
     Recording,
     SelectionErrors,
+    SensorCalibration,
     SensorDiagnosis,
+    StageResult,
     StepErrors,
 )
 from pipeline.core.verdicts import Verdict
-from pipeline.estimation.stages import declared
-from pipeline.evaluation.diagnosis.diagnose import doubts_of, held_out_of
+from pipeline.estimation.stages import StageInput, StageOutput, declared, fit_stage, last_fit
+from pipeline.evaluation.diagnosis.diagnose import diagnose, doubts_of, held_out_of
 from pipeline.evaluation.diagnosis.verdict import HeldOutError, VerdictInput, decide, judged, verdict_of_selection
 from pipeline.output.outcome import commands_of
 from pipeline.output.pages.parameters import summary_row
 from tests.published import TESTED, candidate
+from tests.unit_settings import with_noise
 
 INSIDE, ABOVE, BELOW = HeldOutError(1.0, 0.9, 1.2), HeldOutError(9.0, 0.9, 1.2), HeldOutError(0.5, 0.9, 1.2)
 REFERENCE, OF_STAGED, OF_HAND = (
@@ -40,6 +47,16 @@ REFERENCE, OF_STAGED, OF_HAND = (
 )
 NOTHING = VerdictInput("gyroscope", "nothing_missing", over_noise=1.0, published=INSIDE, **REFERENCE)
 BY_HAND = replace(NOTHING, **OF_HAND, on_table=False)
+# its bias by a stage that keeps the matrix; free fits after known effects
+KEEPS = replace(BY_HAND, method="bias_of_rests", fit=declared("gyroscope", "bias"), moves=MovesError(0.79, 4.25, 31.2))
+OF_KNOWN = {
+    "method": "known_temperature",
+    "fit": last_fit(
+        SensorCalibration(
+            "gyroscope", stages=tuple(StageResult(n, {}) for n in ("known_temperature", "rests_and_moves", "effects"))
+        )
+    ),
+}
 MISSING = replace(NOTHING, found="missing_effect", selected=("g_sensitivity",), over_noise=9.0, left_over_noise=1.0)
 STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, **OF_STAGED)
 
@@ -75,6 +92,17 @@ def held_out(after: float) -> SelectionErrors:
             "unexplained",
             "direction of gravity by 5.1 times the noise",
         ),
+        (KEEPS, "left_by_method", "which the uncertainty of what the method bias_of_rests keeps explains"),
+        (replace(KEEPS, held_by_limit="the method does not estimate the matrix: why"), "not_enough_data", "the matrix"),
+        (replace(KEEPS, found="not_enough_data"), "not_enough_data", ""),
+        (replace(KEEPS, moves=MovesError(2.9, 0.5, 31.2)), "unexplained", "2.9 deg (rms)"),
+        (replace(KEEPS, method="given"), "left_by_method", "which the uncertainty of the given calibration explains"),
+        (
+            replace(KEEPS, method="given", approximations=("bias",), moves=MovesError(2.9, 0.5, 31.2)),
+            "left_by_method",
+            "differs from a free fit of these recordings in bias",
+        ),
+        (replace(BY_HAND, **OF_KNOWN, moves=MovesError(2.9, 3.5, 5.1)), "unexplained", "5.1 times the noise"),
         (replace(NOTHING, published=ABOVE, over_noise=4.0), "unexplained", "4 times its noise"),
         (replace(NOTHING, published=BELOW), "floor_in_doubt", "estimate is too large"),
         (replace(NOTHING, static=ABOVE), "reference_in_doubt", "static"),
@@ -212,3 +240,21 @@ def test_a_note_on_the_turns_of_one_sensor_does_not_concern_the_other() -> None:
     assert doubts_of("gyroscope", [turn]) == [f"{turn.name}: angle and rate differ"]
     assert doubts_of("accelerometer", [turn]) == []
     assert len(doubts_of("accelerometer", [held_out])) == 1
+
+
+def test_a_stage_that_keeps_the_matrix_is_not_blamed_on_the_sensor() -> None:
+    hand = draw_hand(Hand(rests=12, rest_s=2.0, rate_hz=50.0), 1)
+    recordings = with_noise([hand.recording], hand.settings)
+    accelerometer = fit_stage("accelerometer", "nonlinear_least_squares", recordings, None, hand.settings)
+    given = StageInput("gyroscope", recordings, None, hand.settings, "bias")
+    rests = given.rests
+    each = np.tile(np.eye(3), (len(rests.time), 1))
+    kept = StageOutput(
+        estimated=BIAS_NAMES, bias=(bias := rests.reading.mean(axis=0)), rests=rests, jacobian=-each, by_reading=each,
+        residual=(rests.reading - bias).ravel(), row=np.repeat(np.arange(len(rests.time)), 3),
+    ).calibration(given)  # fmt: skip
+    noise, moves = recordings.noises["gyroscope"], MovesError(0.79, 4.25, 31.2)
+    found = diagnose(kept, recordings.filtered, noise, hand.settings, accelerometer, moves=moves)
+    assert found.verdict == "not_enough_data"
+    assert "the method does not estimate the matrix, known by the limit" in found.reason
+    assert "choose a method that estimates it" in found.next_experiment

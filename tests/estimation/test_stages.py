@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import BIAS_NAMES, LIMIT, MATRIX, Recording, SensorCalibration
 from pipeline.estimation import stages
+from pipeline.estimation.rest_means import Rests, rests_of
 from pipeline.estimation.stages import StageInput, StageOutput
 from pipeline.simulation.description import shipped_settings
 from tests.unit_settings import settings_of, with_noise
@@ -43,17 +45,18 @@ def by_length(given: StageInput) -> StageOutput:
     rests, g, bias = given.rests, given.settings.table.gravity_g, np.zeros(3)
     for _ in range(10):
         force = rests.reading - bias
-        residual = np.sum(force**2, axis=1) - g**2
-        bias = bias + np.linalg.lstsq(2.0 * force, residual)[0]
+        length = np.linalg.norm(force, axis=1, keepdims=True)
+        residual, direction = length[:, 0] - g, force / length
+        bias = bias + np.linalg.lstsq(direction, residual)[0]
     return StageOutput(
-        estimated=BIAS_NAMES, bias=bias, rests=rests, residual=residual, jacobian=-2.0 * force, by_reading=2.0 * force,
-        by_gravity=np.full(len(residual), -2.0 * g),
+        estimated=BIAS_NAMES, bias=bias, rests=rests, residual=residual, jacobian=-direction, by_reading=direction,
+        by_gravity=np.full(len(residual), -1.0),
     )  # fmt: skip
 
 
-def mean_of_rests(given: StageInput) -> StageOutput:
+def mean_of_rests(given: StageInput, rests: Rests | None = None) -> StageOutput:
     """The bias of the gyroscope: three equations for each rest."""
-    rests = given.rests
+    rests = rests or given.rests
     bias, m = rests.reading.mean(axis=0), len(rests.time)
     return StageOutput(
         estimated=BIAS_NAMES, bias=bias, rests=rests, residual=(rests.reading - bias).ravel(),
@@ -113,6 +116,30 @@ def test_an_effect_at_its_limit_changes_the_bias_by_what_a_fit_to_it_finds() -> 
     other = StageInput("accelerometer", with_noise([bent], SETTINGS), None, SETTINGS, "bias")
     change = by_length(other).calibration(other).bias - found.bias
     assert found.at_limits["quadratic_nonlinearity"][:3, 0] == pytest.approx(change, abs=0.1 * np.abs(change).max())
+
+
+def test_effects_at_their_limits_are_those_of_the_force_in_the_rests_of_the_stage() -> None:
+    given, rng = task(6), np.random.default_rng(6)
+    static = []
+    for k in range(len(UP)):  # as many rests as the fit has, all with z up
+        time = (np.arange(500) + 100_000 * (k + 1)) * 20_000_000
+        force = [0.0, 0.0, 1.0] + 3e-3 * rng.normal(size=(500, 3))
+        static.append(
+            Recording(f"s{k}", "static", None, time, accelerometer=force, gyroscope=0.03 * rng.normal(size=(500, 3)))
+        )
+    logged = with_noise([*given.recordings.filtered, *static], SETTINGS)
+    limit = SETTINGS.sensor.gyroscope.effects["g_sensitivity"]
+    rests = rests_of("gyroscope", logged.filtered, SETTINGS.procedure, role="static")
+    assert rests is not None
+    assert len(rests.time) == len(given.rests.time)
+    for recordings, most in ((logged.filtered, [0.0, 0.0, limit]), ([*map(no_force, logged.filtered)], [limit] * 3)):
+        of_static = replace(given, sensor="gyroscope", recordings=replace(logged, filtered=recordings))
+        changes = mean_of_rests(of_static, rests).calibration(of_static).at_limits["g_sensitivity"]
+        assert np.abs(changes[:3]).sum(axis=0).reshape(3, 3) == pytest.approx(np.tile(most, (3, 1)), abs=0.01 * limit)
+
+
+def no_force(recording: Recording) -> Recording:
+    return recording.with_readings(accelerometer=None) if recording.role == "static" else recording
 
 
 def test_equations_that_do_not_determine_the_estimates_are_refused() -> None:

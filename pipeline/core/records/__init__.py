@@ -16,6 +16,7 @@ from pipeline.core.records.budget import (
     MATRIX_ROWS,
     MONTE_CARLO,
     NORMAL,
+    NOT_ESTIMATED,
     RECTANGULAR,
     Budget,
     BudgetLine,
@@ -103,8 +104,9 @@ from pipeline.core.records.recording import (
 
 __all__ = [
     "AFTER_BASE", "AXES", "BASE", "BASE_COUNT", "BASE_NAMES", "BETWEEN_ATTITUDES_S", "BIAS", "BIAS_NAMES",
-    "FEWEST_MOVES", "LACK_OF_FIT", "LIMIT", "MATRIX", "MATRIX_NAMES", "MATRIX_ROWS", "MEDIAN_SIZE", "MONTE_CARLO",
-    "NOISE_OF_ROWS", "NORMAL", "READABLE_VERSIONS", "RECTANGULAR", "SCHEMA_VERSION", "SENSORS", "SENSOR_UNITS",
+    "FEWEST_MOVES", "LACK_OF_FIT", "LIMIT", "MATRIX", "MATRIX_NAMES", "MATRIX_ROWS", "MEDIAN_SIZE",
+    "MONTE_CARLO", "NOISE_OF_ROWS", "NORMAL", "NOT_ESTIMATED", "READABLE_VERSIONS", "RECTANGULAR", "SCHEMA_VERSION",
+    "SENSORS", "SENSOR_UNITS",
     "Agreement", "Answer", "Budget", "BudgetLine", "Candidate", "Coefficient", "Contribution", "Convergence",
     "CorrectionStep", "Dependence", "Estimate", "Fit", "FittedEffect", "FittedForm", "Index", "Integers", "LimitCheck",
     "Mask", "MethodError", "MonteCarlo", "Motion", "MovesError", "Multiply", "NoMonteCarlo", "Noise", "NoiseParts",

@@ -32,6 +32,7 @@ BIAS, MATRIX = slice(0, len(BIAS_NAMES)), slice(len(BIAS_NAMES), BASE_COUNT)
 MATRIX_ROWS = tuple(slice(start, start + len(AXES)) for start in range(MATRIX.start, MATRIX.stop, len(AXES)))
 NORMAL, RECTANGULAR = "normal", "rectangular"
 LIMIT = "not determined by the recordings: limit of the sensor file"  # a source of the uncertainty budget
+NOT_ESTIMATED = "not estimated by the method: "  # begins its remark where no stage estimates the elements that follow
 LACK_OF_FIT = "lack of fit"  # a part of the noise of the readings
 PART_NAMES = {
     "white": "white noise",

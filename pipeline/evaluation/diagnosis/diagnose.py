@@ -268,7 +268,7 @@ def evidence_of(
 
     The held-out errors of the free fits are computed only if that of the calibration is above its interval.
     """
-    sensor, recordings, settings = case.sensor, case.recordings, case.settings
+    sensor, recordings, settings, fit = case.sensor, case.recordings, case.settings, last_fit(case.calibration)
     free, full = (findings.free, findings.full) if findings else (None, None)
 
     def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOutError | None:
@@ -313,10 +313,10 @@ def evidence_of(
         implausible=() if accepted else [entry.effect for entry in found.chosen if not entry.plausible],
         held_out=found.on_table.held_out if found.on_table else None,
         method=settings.method.of(sensor) or "",
-        fit=last_fit(case.calibration),
+        fit=fit,
         as_printed=settings.method.as_printed,
         filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
-        held_by_limit=not_determined(case.calibration.to_json()) if settings.procedure.sheet else "",
+        held_by_limit=not_determined(case.calibration.to_json()) if settings.procedure.sheet or not fit.free else "",
         on_table=findings is None or findings.on_table,
     )
 

@@ -53,15 +53,16 @@ RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
     (Verdict.UNEXPLAINED, "above_as_the_residual", lambda e: e.above and e.at_noise is False),
     (Verdict.REFERENCE_IN_DOUBT, "contradiction", lambda e: e.above),
     (Verdict.UNEXPLAINED, "unexplained", lambda e: e.unexplained),
-    (Verdict.UNEXPLAINED, "moves", lambda e: e.moves and e.moves.over_largest > 1.0 and not e.missing),
-    (Verdict.UNEXPLAINED, "far_moves", lambda e: e.moves and e.moves.over_noise > MARK_AFTER_MOVES and not e.missing),
+    (Verdict.UNEXPLAINED, "moves", lambda e: e.beyond_moves and not e.missing),
+    (Verdict.UNEXPLAINED, "far_moves", lambda e: e.far_after_moves and e.fit.free and not e.missing),
     (Verdict.UNEXPLAINED, "scatter", lambda e: e.scatter > MAX_SCATTER_BY_HAND and not e.missing),
     (Verdict.MISSING_EFFECT, "missing", lambda e: e.missing),
     (Verdict.REFERENCE_IN_DOUBT, "disagreement", lambda e: e.disagrees),
     (Verdict.FLOOR_IN_DOUBT, "below", lambda e: e.published and e.published.below),
     (Verdict.FLOOR_IN_DOUBT, "too_quiet", lambda e: e.too_quiet),
-    (Verdict.LEFT_BY_METHOD, "approximations", lambda e: e.found == Verdict.NOTHING_MISSING and e.approximations),
-    (Verdict.NOT_ENOUGH_DATA, "held", lambda e: e.found == Verdict.NOTHING_MISSING and e.held_by_limit),
+    (Verdict.LEFT_BY_METHOD, "approximations", lambda e: e.nothing_missing and e.approximations),
+    (Verdict.LEFT_BY_METHOD, "kept", lambda e: e.nothing_missing and e.far_after_moves and not e.held_by_limit),
+    (Verdict.NOT_ENOUGH_DATA, "held", lambda e: e.nothing_missing and e.held_by_limit),
 )
 
 
@@ -115,13 +116,30 @@ class VerdictInput:
     fit: FitStage = field(default_factory=FitStage)  # last stage of the method
     as_printed: bool = False  # whether the method uses the equations of the thesis as printed
     filtered: bool = False
-    held_by_limit: str = ""  # parameters that the sensor file's limits determine, and what to record (a sheet's unit)
+    # parameters that the sensor file's limits determine, and what would; of a sheet, or of a stage that keeps them
+    held_by_limit: str = ""
     on_table: bool = True  # a few rests by hand may have a small residual by chance
 
     @property
     def above(self) -> bool:
         """Whether the held-out error of the calibration is above its interval."""
         return self.published is not None and self.published.above
+
+    @property
+    def nothing_missing(self) -> bool:
+        """Whether the selection found nothing."""
+        return self.found == Verdict.NOTHING_MISSING
+
+    @property
+    def beyond_moves(self) -> bool:
+        """Whether held-out moves miss by more than noise, uncertainties and errors of a given calibration explain."""
+        of_given = self.given and self.nothing_missing and self.approximations
+        return self.moves is not None and self.moves.over_largest > 1.0 and not of_given
+
+    @property
+    def far_after_moves(self) -> bool:
+        """Whether held-out moves by hand show far more than noise; the uncertainty of what a method keeps may do so."""
+        return self.moves is not None and self.moves.over_noise > MARK_AFTER_MOVES
 
     @property
     def left(self) -> float | None:
@@ -163,12 +181,12 @@ class VerdictInput:
     def too_quiet(self) -> bool:
         """Whether the residual is too small for the noise estimate."""
         small = self.over_noise is not None and self.over_noise < MIN_RESIDUAL_OVER_NOISE
-        return small and self.on_table and self.found == Verdict.NOTHING_MISSING
+        return small and self.on_table and self.nothing_missing
 
     @property
     def disagrees(self) -> bool:
         """Whether held-out motion contradicts the matrix and the selection found nothing."""
-        return bool(self.agreement and self.found == Verdict.NOTHING_MISSING and self.agreement.p_value < DISAGREES)
+        return bool(self.agreement and self.nothing_missing and self.agreement.p_value < DISAGREES)
 
     @property
     def given(self) -> bool:
@@ -269,6 +287,7 @@ FIGURE_OF: dict[str, Callable[[VerdictInput], str]] = {  # by the reason; of all
     "moves": lambda e: decided_words("angle_expected", e.moves.over_largest if e.moves else None),
     "far_moves": lambda e: decided_words("angle", e.moves.over_noise if e.moves else None),
     "scatter": lambda e: decided_words("scatter", e.scatter),
+    "kept": lambda e: decided_words("angle", e.moves.over_noise if e.moves else None),
     "disagreement": lambda e: decided_words(
         "agreement", abs(e.agreement.error) / e.agreement.expanded_uncertainty if e.agreement else None
     ),
@@ -346,7 +365,8 @@ def _next_step(verdict: Verdict, diagnosis: SensorDiagnosis, e: VerdictInput) ->
         held = e.held_by_limit.rpartition(": ")[2] if verdict == Verdict.NOT_ENOUGH_DATA else ""
         return STATIC_AGAIN if verdict == Verdict.FLOOR_IN_DOUBT else held
     changes = ["the equations as corrected (method.as_printed=false)"] if e.as_printed else []
-    free = ["the default method" if e.given else "a method that fits the full matrix (method=reference_least_squares)"]
+    default, reference = "the default method", "a method that fits the full matrix (method=reference_least_squares)"
+    free = [default if e.given or not e.on_table else reference]
     changes += [] if e.fit.free else free
     changes += ["no filter (filter=none)"] if e.filtered else []
     return f"calibrate the same recordings with {' and '.join(changes)}" if changes else ""

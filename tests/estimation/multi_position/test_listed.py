@@ -330,6 +330,20 @@ def test_a_soak_that_heats_and_cools_shows_lag_and_hysteresis(
         assert all(abs(p["value"] - b) < 1.5 * p["expanded_uncertainty"] for p, b in pairs)
 
 
+def test_a_lag_below_its_gate_is_no_hysteresis(tmp_path: Path) -> None:
+    rng, n, keep = np.random.default_rng(27), 5400, np.exp(-0.5)  # a lag of 2 s; here hysteresis passes the test, too
+    die = 30.0 * np.sin(np.pi * np.arange(n) / n) ** 2
+    warm = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], die)
+    gyro = np.outer(die, [0.005, -0.01, 0.015]) + [0.5, -1.0, 2.0] + 5e-3 * np.sqrt(0.5) * rng.normal(size=(n, 3))
+    header = "time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,temperature_degc"
+    rows = np.column_stack([np.arange(float(n)), gyro, 25.0 + warm])
+    np.savetxt(tmp_path / "soak.csv", rows, fmt="%.8g", delimiter=",", header=header, comments="")
+    (tmp_path / "recordings.csv").write_text("file,kind\nsoak.csv,soak\n")
+    found = calibrated(tmp_path, "effects.gyroscope=auto").diagnosis["gyroscope"]
+    assert found["selected"] == ["bias_temperature"]
+    assert found["unexplained"] == []
+
+
 def test_rows_beyond_the_soaked_temperatures_are_marked_or_refused(tmp_path: Path) -> None:
     part = SensorCalibration("gyroscope").to_json()
     known = {"calibrated_range": {"temperature_degc": [-20.0, 80.0], "soaked_degc": [10.0, 40.0]}}
