@@ -274,6 +274,8 @@ def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False
             step, decided = (row.get(f"{worst}_{column}") or "" for column in ("next_step", "decided_by"))
             if kind == FAR:
                 decided = next(filter(None, (_far_after_moves(row, s) for s in sensors)), "")
+                moved = [_number(row.get(f"{s}_moves_over_noise")) or 0.0 for s in sensors]
+                ratio = max(ratio, *(over for over in moved if over > MARK_AFTER_MOVES), 0.0)
             groups.setdefault((kind, effects), []).append((ratio, str(row["unit"]), step, sensors, decided))
     order, found = [*KINDS], []
     for (kind, effects), entries in sorted(groups.items(), key=lambda group: order.index(group[0][0])):
@@ -286,7 +288,8 @@ def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False
             others = len({entry[2] for entry in entries}) > 1
             step = entries[0][2] + f" ({entries[0][1]}; the pages of the others state theirs)" * others
         units, span = [unit for _, unit, *_ in entries], (known[-1], known[0]) if known else None
-        decided = _decided([entry[4] for entry in entries]) if kind in {*DOUBTS, FAR} else ""
+        texts = [entry[4] for entry in entries]
+        decided = _decided(texts) if kind in DOUBTS or (kind == FAR and all(texts)) else ""
         found.append(Problem(kind, what, units, span, step, effects, decided))
     return found
 

@@ -208,6 +208,9 @@ def test_a_unit_far_above_noise_by_its_moves_is_said_to_be_so_in_one_way() -> No
     text = Text(page).text
     assert "Gyroscope: 1 of 1 units far above noise; angle after held-out moves, 12.9 × noise in U1" in text
     assert "above 3 × noise;" not in text
+    other = row | {"unit": "U2", "gyroscope_error_after": 0.04}
+    (problem,) = problems([row | {"gyroscope_moves_over_noise": 12.9}, other])
+    assert problem_words(problem) == "far above noise: 2 units: U1, U2; gyroscope; 4 to 12.9 x noise"
     for far, shown in ((True, page), (False, campaign_page.render("bench", [row], []))):
         (of_unit,) = re.findall(r'<tr><th scope="row">[^\n]*U1.*?</tr>', shown.partition('id="all"')[2], re.DOTALL)
         assert ("nothing missing" in of_unit, "good-text" in of_unit) == (not far, not far)
