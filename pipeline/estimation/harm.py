@@ -11,6 +11,7 @@ with the correlation r of successive ones. The others stay selected.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -116,18 +117,19 @@ def _harmful_in_turns(selection: Selection, fits: Sequence[JointFit]) -> dict[st
 class LeftOut:
     """The squared errors of each fit of a selection at rests, and in moves, that are left out of it in turn."""
 
-    of_rests: Sequence[Values]  # each (m,), g^2 or (deg/s)^2; without a fit's effects, and with each further one
+    of_rests: Sequence[Values]  # each (m,), g^2 or (deg/s)^2; none of the last fits, if folds have too few equations
     of_moves: Sequence[Values] = ()  # each (k,), deg^2; of the gyroscope
     judged: Sequence[bool] = ()  # whether each fit has some degrees of freedom in every fold
 
     @property
     def errors(self) -> list[float | None]:
         """The rms error of each fit."""
-        pairs = zip(self.of_rests, self.judged, strict=True)
+        pairs = zip_longest(self.of_rests, self.judged)
         return [float(np.sqrt(np.mean(squares))) if known else None for squares, known in pairs]
 
     def harmful(self, names: Sequence[str]) -> dict[str, str]:
         """Return the effects that raise an error significantly, with the reason."""
+        names = names[: max(0, len(self.of_rests) - 1)]
         of_moves = harmful(names, self.of_moves, "after moves that the fit leaves out") if self.of_moves else {}
         return of_moves | harmful(names, self.of_rests, "at rests that the fit leaves out")
 
@@ -154,11 +156,14 @@ def left_out(
     others = [model.without(~held) for _, held in parts] if isinstance(model, GyroscopeModel) else []
     moving = bool(others) and all(part.moves is not None for part in others)
     for count, each in enumerate(selection.fits):
+        equations = min(len(part.equations(each.state).residual) for part in models)
+        judged.append(equations >= each.rank + SPARE)
+        if equations <= each.rank:
+            continue
         fits = [
             known(k, count) or fit(part, each.state, selection.hypotheses, selection.bounds, small=COMPARED_STEP)
             for k, part in enumerate(models)
         ]
-        judged.append(all(len(fitted.residual) >= fitted.rank + SPARE for fitted in fits))
         rests.append(
             np.concatenate([_at_rests(model, part, fitted) for part, fitted in zip(models, fits, strict=True)])
         )

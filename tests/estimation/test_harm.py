@@ -11,6 +11,8 @@ from bench_session import CONTINUOUS, Session, record
 from hand_session import hand_held
 from unit_settings import settings_of, with_noise
 
+from imu_research.study.cases import draw
+from imu_research.study.run import diagnose_case
 from pipeline.estimation import effects, harm
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
@@ -75,3 +77,16 @@ def test_auto_by_hand_leaves_out_what_raises_the_error_in_left_out_rests(monkeyp
     worse = replace(errors, of_rests=errors.of_rests[::-1], of_moves=errors.of_moves[::-1])
     monkeypatch.setattr(effects, "left_out", lambda *_: worse)
     assert effects.fit(StageInput("gyroscope", recordings, before, settings)) is before
+
+
+def test_an_effect_for_which_the_rests_of_the_published_fit_are_too_few_is_a_candidate() -> None:
+    """Bias, matrix and nine further parameters from the 16 of 24 rests that are not held out: ``add`` would fail."""
+    _, state = diagnose_case(draw("hand_orientations_24", 11, 4202))
+    part = state.diagnosis["accelerometer"]
+    assert (part["verdict"], part["selected"]) == ("unexplained", [])
+    (candidate,) = part["candidates"]
+    assert candidate["effect"] == "cross_axis_nonlinearity"
+    assert candidate["reason"].startswith(
+        "the 16 rests of the fit are too few for it: record at least 26 rests in as many "
+    )
+    assert part["answer_set"][0]["effects"] == ["cross_axis_nonlinearity"]

@@ -44,6 +44,7 @@ from pipeline.estimation.multi_position.model import NoiseHypothesis
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import LAG, SelectionByHand, hysteresis_of, posterior
 from pipeline.estimation.noise import noise_of
+from pipeline.estimation.rest_means import held_out_rests
 from pipeline.estimation.stages import StageInput, is_given
 from pipeline.evaluation.diagnosis import functional_forms as forms
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
@@ -123,7 +124,7 @@ def findings(case: DiagnosisInput) -> Findings:
         drop_alone=lambda name: float(signal[name] @ signal[name]) if name in signal else 0.0,
         excess=max(chi[0] - (len(selection.fits[0].residual) - selection.fits[0].rank), chi[0] - chi[-1]),
         held_out=held_out.errors,
-        harmful=held_out.harmful(selection.names),
+        harmful=held_out.harmful(selection.names) | _too_few(selection, case),
         hidden=hidden,
         unknown=unknown,
         over_noise=over,
@@ -244,6 +245,22 @@ def _held_out(selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand,
         return folds[k][0].fits[count] if same else None
 
     return left_out(selection, [(fold.model, held) for fold, held in folds], known)
+
+
+def _too_few(selection: SelectionByHand, case: DiagnosisInput) -> dict[str, str]:
+    """Return the selected effects that the rests of the published fit do not determine, with the reason.
+
+    The selection uses the rests that are held out of that fit, too.
+    """
+    rests = len(selection.model.rests.time)
+    used = rests - sum(map(len, held_out_rests(case.recordings, case.settings.procedure).values()))
+    pairs = zip(selection.names, selection.fits[1:], strict=True)
+    return {
+        name: f"the {used} rests of the fit are too few for it: record at least {fit.rank + 10} rests in as many "
+        "orientations, or hold none out (procedure.holdout_every=0)"
+        for name, fit in pairs
+        if len(fit.residual) * used <= fit.rank * rests
+    }
 
 
 def _cross_validation(
