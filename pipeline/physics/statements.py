@@ -69,7 +69,9 @@ DIFFERENT = 1.1  # ratio of both uncertainties above which pages, terminal and c
 NAMED_EFFECTS = 4  # in a sentence
 NEGLIGIBLE = 1e-3  # of U of every parameter: a change below it is not listed
 OF_BUDGET = {"time base": "clock_rate", "Earth's rotation": "earth_rotation"}  # source that is not included: its effect
-ESTIMATE_IT = "choose a method that estimates it, such as the default method"
+ESTIMATE_IT = (
+    "choose a method that estimates it (method=rests_and_moves by hand, method=reference_least_squares on a table)"
+)
 NOT_DIAGNOSED = "the diagnosis failed, so that it is not known what the recordings show"
 LEFT_OUT_REASONS = {
     "N-STUCK": "stuck",

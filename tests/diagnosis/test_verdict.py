@@ -162,6 +162,7 @@ def test_the_first_that_applies_is_said_with_its_numbers(evidence: VerdictInput,
     assert bool(said.override) == (verdict == "missing_effect")
     if not evidence.on_table:
         assert "table" not in step + reason
+        assert (verdict != "left_by_method") or "(method=rests_and_moves)" in step
     if evidence.method == "reference_least_squares":
         assert "reference_least_squares" not in step + reason
 

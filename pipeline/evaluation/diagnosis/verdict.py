@@ -365,8 +365,8 @@ def _next_step(verdict: Verdict, diagnosis: SensorDiagnosis, e: VerdictInput) ->
         held = e.held_by_limit.rpartition(": ")[2] if verdict == Verdict.NOT_ENOUGH_DATA else ""
         return STATIC_AGAIN if verdict == Verdict.FLOOR_IN_DOUBT else held
     changes = ["the equations as corrected (method.as_printed=false)"] if e.as_printed else []
-    default, reference = "the default method", "a method that fits the full matrix (method=reference_least_squares)"
-    free = [default if e.given or not e.on_table else reference]
+    method = "reference_least_squares" if e.on_table else "rests_and_moves"
+    free = ["the default method" if e.given and e.on_table else f"a method that fits the full matrix (method={method})"]
     changes += [] if e.fit.free else free
     changes += ["no filter (filter=none)"] if e.filtered else []
     return f"calibrate the same recordings with {' and '.join(changes)}" if changes else ""
