@@ -38,6 +38,7 @@ FIGURES = {  # what decides a verdict: in the words of pages, index, terminal an
     "below": ("held-out error", "{:.3g} x the least expected"),
     "method": ("difference from a free fit", ""),
     "held": ("parameters that the sensor file determines", ""),
+    "probability": ("probability of", ""),
 }
 DECIDED = re.compile(r"(?P<figure>.+), (?P<times>\S+) x (?P<of>.+)")
 

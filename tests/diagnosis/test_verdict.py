@@ -92,6 +92,8 @@ def held_out(after: float) -> SelectionErrors:
             "unexplained",
             "direction of gravity by 5.1 times the noise",
         ),
+        (replace(NOTHING, likely=("g_sensitivity",)), "not_enough_data", "most probable one, g sensitivity, does not"),
+        (replace(MISSING, likely=("g_sensitivity",)), "missing_effect", ""),
         (KEEPS, "left_by_method", "which the uncertainty of what the method bias_of_rests keeps explains"),
         (replace(KEEPS, held_by_limit="the method does not estimate the matrix: why"), "not_enough_data", "the matrix"),
         (replace(KEEPS, found="not_enough_data"), "not_enough_data", ""),

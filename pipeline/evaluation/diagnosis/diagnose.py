@@ -316,6 +316,7 @@ def evidence_of(
         fit=fit,
         as_printed=settings.method.as_printed,
         filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
+        likely=found.answer_set[0].effects if found.answer_set and all(a.effects for a in found.answer_set) else (),
         held_by_limit=not_determined(case.calibration.to_json()) if settings.procedure.sheet or not fit.free else "",
         on_table=findings is None or findings.on_table,
     )

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from pipeline.core.verdicts import MARK_AFTER_MOVES, Verdict, decided_words
 from pipeline.estimation.stages import FitStage
 from pipeline.evaluation.diagnosis.words import listed, of_unknown, plain, template
+from pipeline.physics.effects import catalogue
 from pipeline.physics.effects.base import unit_of
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
     (Verdict.LEFT_BY_METHOD, "approximations", lambda e: e.nothing_missing and e.approximations),
     (Verdict.LEFT_BY_METHOD, "kept", lambda e: e.nothing_missing and e.far_after_moves and not e.held_by_limit),
     (Verdict.NOT_ENOUGH_DATA, "held", lambda e: e.nothing_missing and e.held_by_limit),
+    (Verdict.NOT_ENOUGH_DATA, "undecided", lambda e: e.nothing_missing and e.likely),
 )
 
 
@@ -117,6 +119,7 @@ class VerdictInput:
     as_printed: bool = False  # whether the method uses the equations of the thesis as printed
     filtered: bool = False
     # parameters that the sensor file's limits determine, and what would; of a sheet, or of a stage that keeps them
+    likely: Sequence[str] = ()  # the most probable effects, if the 95 % answer set lacks that nothing is missing
     held_by_limit: str = ""
     on_table: bool = True  # a few rests by hand may have a small residual by chance
 
@@ -295,6 +298,7 @@ FIGURE_OF: dict[str, Callable[[VerdictInput], str]] = {  # by the reason; of all
     "too_quiet": lambda e: decided_words("misfit", e.over_noise),
     "approximations": lambda _: decided_words("method"),
     "held": lambda _: decided_words("held"),
+    "undecided": lambda e: decided_words("probability", named=listed([plain(name) for name in e.likely])),
 }
 
 
@@ -363,6 +367,9 @@ def _next_step(verdict: Verdict, diagnosis: SensorDiagnosis, e: VerdictInput) ->
         return SAME_SESSION if e.static_differs and not e.doubts else check
     if verdict != Verdict.LEFT_BY_METHOD:
         held = e.held_by_limit.rpartition(": ")[2] if verdict == Verdict.NOT_ENOUGH_DATA else ""
+        if verdict == Verdict.NOT_ENOUGH_DATA and e.nothing_missing and not held:
+            known = [f": {catalogue()[name].excitation}" for name in e.likely if name in catalogue()]
+            held = f"record as much again{''.join(known[:1])}"
         return STATIC_AGAIN if verdict == Verdict.FLOOR_IN_DOUBT else held
     changes = ["the equations as corrected (method.as_printed=false)"] if e.as_printed else []
     method = "reference_least_squares" if e.on_table else "rests_and_moves"
