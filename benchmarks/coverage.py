@@ -20,12 +20,14 @@ import argparse
 import os
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from imu_research.figures import clustered_share, write_figures
 from pipeline.core.records import SENSORS, NotCalibrated
 from pipeline.physics.effects.base import truth
 from pipeline.physics.kinematics import reference_motion
@@ -171,7 +173,9 @@ def main() -> None:
     parser.add_argument("--conditions", default=",".join(CONDITIONS))
     parser.add_argument("--methods", default="", help="words that a method's name holds, with commas; all by default")
     parser.add_argument("--table", default="acutronic", help="table whose stated errors the condition table has")
+    parser.add_argument("--figures", type=Path, help="file for the shares with their 99 % intervals, clustered by unit")
     arguments = parser.parse_args()
+    figures = []
     words = arguments.methods.split(",")
     methods = [name for name in METHODS if any(word in name for word in words)]
     for condition in arguments.conditions.split(","):
@@ -182,6 +186,7 @@ def main() -> None:
         for name, ratios in found.items():
             known = ~np.all(np.isnan(ratios), axis=0)
             inside = np.abs(ratios[:, known]) <= 1.0
+            figures += clustered_share(f"{name}, {condition}", list(inside), "contains 95 %")
             each = 100.0 * inside.mean(axis=0)
             units = 100.0 * inside.mean(axis=1)
             print(
@@ -189,6 +194,8 @@ def main() -> None:
                 f"parameters {each.min():5.1f} to {each.max():5.1f} %: {' '.join(f'{e:.1f}' for e in each)}",
                 flush=True,
             )
+    if arguments.figures:
+        write_figures(arguments.figures, figures)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,8 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from imu_research.figures import MeasuredFigure, write_figures
+
 PAUSE_S = 15.0, 120.0  # between two measurements of the floor: at first, and in a long run
 ROOT = Path(__file__).resolve().parents[1]
 MEASURED = 100  # units of the floor
@@ -71,6 +73,7 @@ def main() -> int:
     parser.add_argument("--units", type=int, default=100)
     parser.add_argument("--simulated", type=int, default=1000, help="most units with recordings of their own")
     parser.add_argument("--cores", type=int, default=2)
+    parser.add_argument("--figures", type=Path, help="file for cost and ratio")
     parser.add_argument("--folder", type=Path, help="where everything stays, for a run that may be interrupted")
     arguments = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -80,7 +83,9 @@ def main() -> int:
         if not (folder / "fleet/ready").is_file():
             _lay_out(folder, arguments.units, min(arguments.units, arguments.simulated))
         _run(folder, arguments.cores)
-        _report(folder, arguments.cores)
+        figures = _report(folder, arguments.cores)
+    if arguments.figures:
+        write_figures(arguments.figures, figures)
     return 0
 
 
@@ -138,8 +143,8 @@ def _run(folder: Path, cores: int) -> None:
         raise SystemExit((folder / "log").read_text(encoding="utf-8")[-2000:] + "\nThe same command continues.")
 
 
-def _report(folder: Path, cores: int) -> None:
-    """Print what all runs of the campaign have used."""
+def _report(folder: Path, cores: int) -> list[MeasuredFigure]:
+    """Print what all runs of the campaign have used; returns cost, ratio to the floor, and the largest process."""
     runs: list[dict[str, Any]] = [json.loads(line) for line in (folder / "runs").read_text().splitlines()]
     used, wall = sum(run["cpu"] for run in runs), sum(run["wall"] for run in runs)
     floors, speeds = ([value for run in runs for value in run[key]] for key in ("floors", "speeds"))
@@ -172,6 +177,11 @@ def _report(folder: Path, cores: int) -> None:
     milliseconds = _range([1000 * floor for floor in floors])
     print(f"floor: {1000 * least:.1f} ms a unit, median of {len(floors)} measurements of {milliseconds} ms")
     print(f"ratio to the floor: {used / units / least:.1f}")
+    return [
+        MeasuredFigure(f"CPU a unit, {units} units", 1000.0 * used / units, units, unit="ms"),
+        MeasuredFigure(f"... over the floor, {units} units", used / units / least, units, "<= 22", unit="times"),
+        MeasuredFigure(f"largest process, {units} units", memory[largest], units, unit="MB"),
+    ]
 
 
 def _range(values: list[float]) -> str:

@@ -38,7 +38,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_research.figures import wilson
+from imu_research.figures import MeasuredFigure, wilson, write_figures
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import CYCLE_DEGC, NOISES, StudyCase, draw
 from imu_research.study.run import held_out_errors
@@ -280,6 +280,7 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="number of the first one, to divide a long study")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--figures", type=Path, help="file for the shares with their 95 % intervals")
     parser.add_argument("--depth", default="standard", choices=("standard", "full"))
     arguments = parser.parse_args()
     lines = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.is_file() else []
@@ -293,15 +294,18 @@ def main() -> None:
                 print(f"\r{len(lines)} of {arguments.n}", end="", file=sys.stderr)
     print()
     if arguments.what == "hidden":
-        _share("exact form", [line["exact"] for line in lines])
-        _share("held-out error at the floor", [line["floor"] for line in lines])
+        found = _share("exact form", [line["exact"] for line in lines], ">= 60 %")
+        found += _share("held-out error at the floor", [line["floor"] for line in lines])
     else:
-        _share("units with an invented formula", [bool(n["invented"]) for n in lines if n["judged"]])
+        found = _share("units with an invented formula", [bool(n["invented"]) for n in lines if n["judged"]], "<= 1 %")
+    if arguments.figures:
+        write_figures(arguments.figures, found)
 
 
-def _share(name: str, hits: list[bool]) -> None:
+def _share(name: str, hits: list[bool], goal: str = "") -> list[MeasuredFigure]:
     low, high = wilson(sum(hits), len(hits))
     print(f"{name}: {sum(hits)} of {len(hits)}, 95 % interval {100 * low:.1f} to {100 * high:.1f} %")
+    return [MeasuredFigure(name, sum(hits) / len(hits), len(hits), goal, (low, high))]
 
 
 if __name__ == "__main__":

@@ -16,14 +16,17 @@ import argparse
 import os
 import time
 from collections import Counter, defaultdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+import pandas as pd
 from scipy.signal import fftconvolve, lfilter
 from scipy.stats import beta
 
+from imu_research.figures import share, write_figures
 from pipeline.core.records import Recording
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_search import CompositionSearch, best_of, count_of
@@ -179,6 +182,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--figures", type=Path, help="file for the shares with their 95 % intervals")
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
@@ -217,6 +221,10 @@ def main() -> None:
     print("right composition, the others:", interval(sum(short_right), len(short_right)))
     told(covered)
     print("upper limits that hold:", interval(sum(limits), len(limits)))
+    if options.figures:
+        held = [v for (_, enough), values in covered.items() if enough for v in values]
+        shares = share("composition of the noise is right", pd.Series(right), ">= 95 %")
+        write_figures(options.figures, [*shares, *share("intervals that hold the truth", pd.Series(held), ">= 95 %")])
     for (expected, got), k in wrong.most_common(15):
         print(f"  {k}: {expected} -> {got}")
 

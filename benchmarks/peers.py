@@ -26,6 +26,7 @@ import re
 import subprocess
 import tempfile
 import time
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -37,6 +38,7 @@ from scipy import stats
 from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
+from imu_research.figures import MeasuredFigure, write_figures
 from pipeline.app.config import load_campaign
 from pipeline.app.one_unit import unit_of_campaign, unit_row
 from pipeline.core.records import SENSORS
@@ -248,11 +250,32 @@ def held_out(found: Estimate, recordings: list[Recording]) -> tuple[np.ndarray, 
 
 
 def ratio(mine: np.ndarray, theirs: np.ndarray) -> str:
+    mean, low, high = ratio_of(mine, theirs)
+    return f"{mean:.2f} ({low:.2f} to {high:.2f})"
+
+
+def ratio_of(mine: np.ndarray, theirs: np.ndarray) -> tuple[float, float, float]:
     """Return the geometric mean of a ratio, with its 95 % interval over pairs."""
     logs = np.log(mine / theirs)
     half = stats.t.ppf(0.975, len(logs) - 1) * logs.std(ddof=1) / np.sqrt(len(logs))
-    low, high = np.exp([logs.mean() - half, logs.mean() + half])
-    return f"{np.exp(logs.mean()):.2f} ({low:.2f} to {high:.2f})"
+    return tuple(map(float, np.exp([logs.mean(), logs.mean() - half, logs.mean() + half])))
+
+
+def figures_of(peer: str, pairs: list[tuple[Any, Any]]) -> list[MeasuredFigure]:
+    """Return median errors of both programs and their ratios, where both have a result."""
+    both = [(mine, theirs) for mine, theirs in pairs if theirs is not None]
+    found = [MeasuredFigure(f"{peer}: units with a result", len(both) / len(pairs), len(pairs), unit="of all")]
+    for name in both[0][0]:
+        mine, theirs = (np.array([pair[k][name] for pair in both]) for k in (0, 1))
+        quantity, _, unit = name.rpartition(", ")
+        mean, low, high = ratio_of(mine, theirs)
+        of = f"{peer}: {quantity}"
+        found += [
+            MeasuredFigure(f"{of}, this product", float(np.median(mine)), len(both), unit=unit),
+            MeasuredFigure(f"{of}, peer", float(np.median(theirs)), len(both), unit=unit),
+            MeasuredFigure(f"{of}, ratio", mean, len(both), interval=(low, high), unit="times"),
+        ]
+    return found
 
 
 def table(title: str, pairs: list[tuple[Any, Any]], hidden: tuple[str, ...] = ()) -> list[str]:
@@ -339,16 +362,25 @@ def main() -> None:
     parser.add_argument("--imu-tk", type=Path, help="folder of its source; without it, imu_tk is left out")
     parser.add_argument("--xsens", type=Path, help="folder of the recording")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--figures", type=Path, help="file for medians and ratios on simulated recordings")
     options = parser.parse_args()
+    if find_spec("imucal") is None:
+        raise SystemExit("imucal 2.6.0 is not installed: pip install imucal==2.6.0")
+    if options.imu_tk and not (options.imu_tk / "src" / "calibration.cpp").is_file():
+        raise SystemExit(
+            f"{options.imu_tk}: no source of imu_tk; git clone https://github.com/Kyle-ak/imu_tk (7780270)"
+        )
     with tempfile.TemporaryDirectory() as folder:
         program = build_imu_tk(options.imu_tk, Path(folder)) if options.imu_tk else None
-        lines = []
+        lines, figures = [], []
         if options.units:
             pairs = simulated(options.units, "ferraris", lambda r: imucal(sections_of(r), 50.0))
             lines += table("imucal, simulated faces and turns", pairs)
+            figures += figures_of("imucal 2.6.0", pairs)
         if options.units and program:
             pairs = simulated(options.units, "multi_position", lambda r: imu_tk(program, r, 28.0))
             lines += table("imu_tk, simulated rests in 40 attitudes", pairs, hidden=("case, deg",))
+            figures += figures_of("imu_tk 7780270", pairs)
         lines += [*wearable(program), *mpu6050(program)]
         if program and options.xsens:
             lines += xsens(options.xsens, program)
@@ -356,6 +388,8 @@ def main() -> None:
     print(text)
     if options.out:
         options.out.write_text(text + "\n")
+    if options.figures:
+        write_figures(options.figures, figures)
 
 
 if __name__ == "__main__":

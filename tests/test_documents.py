@@ -62,27 +62,6 @@ def test_the_documents_are_short() -> None:
     assert sum(len(file.read_text().split()) for file in (ROOT / "docs").glob("*.md")) <= 25_000
 
 
-def test_figures_of_the_blind_study_are_those_of_its_table() -> None:
-    table = (ROOT / "docs" / "blind_study.md").read_text()
-    counts = {}
-    for figure, n, share in re.findall(r"^\| ([^|]*) \| (\d+) \| ([\d.]+) % \|", table, re.MULTILINE):
-        counts.setdefault(figure.partition(",")[0].partition(":")[0], []).append(
-            (round(int(n) * float(share) / 100), int(n))
-        )
-    null = counts["nothing hidden"]
-    stated = {
-        "one": counts["one effect at the sensor file's size"][0],
-        "two": counts["two effects"][0],
-        "wander": counts["two effects"][1],
-        "removed": counts["taken out of the catalogue"][0],
-        "null": (sum(found for found, _ in null), sum(n for _, n in null)),
-    }
-    for name in ("README.md", "docs/evidence.md"):
-        text = " ".join((ROOT / name).read_text().split())
-        for found, n in stated.values():
-            assert re.search(rf"\b{found:,} of {n:,}\b|\b{found:,} of (the )?{n:,}\b", text), (name, found, n)
-
-
 def test_functions_that_the_architecture_names_exist() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text()
     named = FUNCTION.findall(text)

@@ -221,9 +221,10 @@ def false_selection_rates(cases: Iterable[ScoredCase]) -> list[MeasuredFigure]:
     found: dict[tuple[str, str], list[float]] = {}
     for (recorded, _, kind), gains in _largest_gains(cases).items():
         found.setdefault((recorded, kind), []).extend(gains)
+    words = {"slow": "a slow", "other": "another"}
     return [
         MeasuredFigure(
-            f"nothing hidden, {recorded}: units in which a {kind} effect passes its gate",
+            f"nothing hidden, {recorded}: units in which {words[kind]} effect passes its gate",
             _passing(gains, kind) / len(gains),
             len(gains),
             "<= 0.1 %",

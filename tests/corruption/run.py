@@ -25,6 +25,7 @@ from good_bench import BASES, good_unit
 from judged import OUTCOMES, SILENT, Judgement, judge, refused
 from unit_copy import TIME, Copy, NotApplicableError, write
 
+from imu_research.figures import MeasuredFigure, wilson, write_figures
 from pipeline.app.config import load_campaign
 from pipeline.core.errors import PipelineError
 
@@ -47,6 +48,8 @@ def main() -> int:
     text = report(judgements, options.seed)
     (out / "table.txt").write_text(text, encoding="utf-8")
     sys.stdout.write(text)
+    if options.figures:
+        write_figures(options.figures, figures(judgements))
     return int(any(j.outcome == SILENT for j in judgements))
 
 
@@ -67,7 +70,23 @@ def parsed() -> argparse.Namespace:
     add("--kind", default="", help="only classes with this word")
     add("--cores", type=int, default=1)
     add("--out", required=True, help="directory for the campaign, its results and the table; replaced")
+    add("--figures", type=Path, help="file for the shares with their 95 % intervals")
     return parser.parse_args()
+
+
+def figures(judgements: list[Judgement]) -> list[MeasuredFigure]:
+    """Return the share of each outcome among the sensors of corrupted units; the goal is that none is silent."""
+    found = [j.outcome for j in judgements if not j.harmless]
+    return [
+        MeasuredFigure(
+            f"corrupted: {outcome}",
+            found.count(outcome) / len(found),
+            len(found),
+            "<= 0 %" if outcome == SILENT else "",
+            wilson(found.count(outcome), len(found)),
+        )
+        for outcome in OUTCOMES
+    ]
 
 
 def drawn(options: argparse.Namespace) -> list[Copy]:

@@ -19,6 +19,7 @@ import numpy as np
 import scipy
 
 import pipeline
+from imu_research.figures import MeasuredFigure, clustered_share, write_figures
 
 RATE_HZ = 100.0
 # As the sensor file mpu6050: white noise of a sample, bias wander, its time; limits of bias, scale factor, cross-axis.
@@ -244,23 +245,40 @@ def run(kind: str, seed: int, number: int) -> dict[str, list[tuple[str, float, b
 def main(argv: list[str]) -> int:
     """Print the coverage of each sensor and group of parameters."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kind", choices=KINDS, required=True)
+    parser.add_argument("--kind", required=True, help=f"{', '.join(KINDS)}; several separated by commas, or all")
     parser.add_argument("--units", type=int, default=30)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--figures", type=Path, help="file for the shares with their 99 % intervals, clustered by unit")
     arguments = parser.parse_args(argv)
+    kinds = [*KINDS] if arguments.kind == "all" else arguments.kind.split(",")
+    figures = [figure for kind in kinds for figure in told(kind, arguments.units, arguments.seed)]
+    if arguments.figures:
+        write_figures(arguments.figures, figures)
+    return 0
+
+
+def told(kind: str, units: int, seed: int) -> list[MeasuredFigure]:
+    """Print the shares of a kind by sensor and group of parameters; returns those of all parameters."""
     counts: dict[tuple[str, str, str], list[float]] = {}
-    for number in range(arguments.units):
-        for sensor, rows in run(arguments.kind, arguments.seed, number).items():
+    by_unit: dict[bool, list[list[bool]]] = {True: [], False: []}
+    for number in range(units):
+        found = run(kind, seed, number)
+        for recorded, each in by_unit.items():
+            each.append([abs(ratio) <= 1.0 for rows in found.values() for _, ratio, by in rows if by is recorded])
+        for sensor, rows in found.items():
             for name, ratio, recorded in rows:
                 group = "bias" if name.startswith("bias") else "scale" if name[-1] == name[-2] else "cross"
                 counts.setdefault((sensor, group, "recordings" if recorded else "sensor_file"), []).append(ratio)
     for (sensor, group, by), ratios in sorted(counts.items()):
         inside = np.abs(ratios) <= 1.0
         sys.stdout.write(
-            f"{sensor:13} {group:6} {by:12} {inside.sum():4d} of {len(ratios):4d} = {inside.mean():.3f}, "
+            f"{kind:16} {sensor:13} {group:6} {by:12} {inside.sum():4d} of {len(ratios):4d} = {inside.mean():.3f}, "
             f"rms error/U {np.sqrt(np.mean(np.square(ratios))):.2f}\n"
         )
-    return 0
+    return [
+        *clustered_share(f"{kind}: determined by the recordings", by_unit[True], "contains 95 %"),
+        *clustered_share(f"{kind}: held by the sensor file", by_unit[False], ">= 95 %"),
+    ]
 
 
 if __name__ == "__main__":

@@ -126,31 +126,23 @@ def test_the_shipped_recordings_are_those_of_the_authors() -> None:
         assert (file / "LICENSE").read_text().startswith("MIT License")
 
 
-def test_the_page_of_evidence_tells_what_the_shipped_campaign_gives(shipped: Bench) -> None:
-    text = (ROOT / "docs" / "evidence.md").read_text()
-    rows = re.findall(r"^\| `(\w+)` \| (\w+), ([\w/]+) \| (.*) \|$", text, re.MULTILINE)
-    assert len(rows) == 6
-    for unit, quantity, measured_in, cells in rows:
-        samples, *said, verdict = (cell.strip(" `") for cell in cells.split("|"))
-        validation, scale = document(shipped, "validations", unit), 1000.0 if measured_in == "mg" else 1.0
-        if quantity == "move":
-            found = validation["gravity_direction"]
-            values = [found["rms_deg"]["before"], found["rms_deg"]["after"], found["noise_floor_deg"]]
-            assert int(samples) == found["moves"]
-            assert [*said[3:], verdict] == ["", ""]
-        else:
-            found = validation[quantity]
-            errors = [found["steps"][0]["rms_error"], found["steps"][-1]["rms_error"]]
-            values = [*errors, found["noise_floor"], *found["expected_rms_error"]]
-            said[3:] = said[3].split(" to ")
-            assert found["held_out"]
-            assert int(samples) == found["samples"]
-            assert verdict == document(shipped, "diagnoses", unit)[quantity]["verdict"]
-            inside = values[3] < values[1] < values[4]  # in the interval in which it is expected
-            assert inside == (verdict in {"nothing_missing", "not_enough_data"})
-        for stated, value in zip(said, values, strict=False):
-            last = 10.0 ** -len(stated.partition(".")[2])
-            assert abs(float(stated) - scale * value) < max(0.02 * scale * value, last), (unit, quantity, stated)
+def test_the_stored_evidence_is_what_the_shipped_campaign_gives(shipped: Bench) -> None:
+    file = ROOT / "benchmarks" / "evidence" / "stored" / "real.json"
+    stored = {figure["name"]: figure for figure in json.loads(file.read_text())["figures"]}
+    for unit in ("mpu6050", "wearable"):
+        validation = document(shipped, "validations", unit)
+        for sensor, scale in (("accelerometer", 1000.0), ("gyroscope", 1.0)):
+            found = validation[sensor]
+            errors = [found["steps"][0]["rms_error"], found["steps"][-1]["rms_error"], found["noise_floor"]]
+            for name, value in zip(("raw", "calibrated", "noise floor"), errors, strict=True):
+                figure = stored[f"{unit} {sensor}, {name}"]
+                assert figure["value"] == pytest.approx(scale * value, rel=0.02)
+                assert figure["total"] == found["samples"]
+            low, high = found["expected_rms_error"]  # the interval in which it is expected
+            verdict = document(shipped, "diagnoses", unit)[sensor]["verdict"]
+            assert (low < errors[1] < high) == (verdict in {"nothing_missing", "not_enough_data"})
+        found = validation["gravity_direction"]
+        assert stored[f"{unit} move, after"]["value"] == pytest.approx(found["rms_deg"]["after"], rel=0.02)
 
 
 def test_ten_rests_are_not_enough_to_tell_an_effect(shipped: Bench) -> None:
