@@ -61,7 +61,8 @@ class KnownTurns(NamedTuple):
 def known_turns(recordings: UnitRecordings, settings: Settings) -> KnownTurns:
     """Return the turns of a sheet; raise ``CannotCalibrateError`` without a rest or a turn."""
     filtered, noise = recordings.filtered, recordings.noises["gyroscope"]
-    rests = rests_of("gyroscope", filtered, settings.procedure)
+    every = rests_of("gyroscope", filtered, settings.procedure)
+    rests = None if every is None or every.held_out.all() else every.select(~every.held_out)
     turns = turns_of(filtered, rests, None, settings.procedure) if rests is not None else None
     if rests is None or turns is None or noise is None:
         raise CannotCalibrateError(

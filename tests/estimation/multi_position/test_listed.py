@@ -179,6 +179,20 @@ def test_a_turn_by_another_angle_is_refused_with_the_angle_that_it_shows(tmp_pat
         calibrated(tmp_path)
 
 
+def test_cholesky_and_lu_do_not_use_rests_that_are_held_out(tmp_path: Path) -> None:
+    """Sixteen rests of moves, of which every third is held out, one rest alone, and two rests of each of three turns."""
+    unit, up = with_three_turns(tmp_path, sensors="ag"), np.array([0.0, 0.0, 1.0])
+    parts = [at_rest(4.0, up)]
+    for k in range(15):
+        parts.append(turned(90.0, 90.0, np.eye(3)[k % 3], parts[-1][0][-1]))
+        parts.append(at_rest(4.0, parts[-1][0][-1]))
+    unit.write("moves", "moves,,,,", *joined(*parts))
+    unit.sheet()
+    found = pipeline.calibrate(tmp_path, sensor=SENSOR, procedure="listed", method="cholesky_lu").calibration
+    (bias, _) = found["gyroscope"]["stages"]
+    assert bias["details"]["rests"] == 16 - 5 + 1 + 6
+
+
 def test_cholesky_and_lu_work_on_turns_by_known_angles(tmp_path: Path) -> None:
     unit = with_three_turns(tmp_path)
     result = pipeline.calibrate(
