@@ -180,7 +180,7 @@ def test_a_turn_by_another_angle_is_refused_with_the_angle_that_it_shows(tmp_pat
 
 
 def test_cholesky_and_lu_do_not_use_rests_that_are_held_out(tmp_path: Path) -> None:
-    """Sixteen rests of moves, of which every third is held out, one rest alone, and two rests of each of three turns."""
+    """Sixteen rests of moves, of which every third is held out, one rest alone, and two of each of three turns."""
     unit, up = with_three_turns(tmp_path, sensors="ag"), np.array([0.0, 0.0, 1.0])
     parts = [at_rest(4.0, up)]
     for k in range(15):
