@@ -8,7 +8,7 @@ alone: wander of the bias that the noise model does not describe has a similar s
 
 False selections (docs/evidence.md, measures ``nothing_by_hand``, ``nothing_on_tables``): of 2,000 units by hand with
 nothing hidden, 5 gain more than 16 by a slow effect, 3 more than 20, and 1 more than 22 (0.05 %, 95 % interval 0.001 to
-0.28 %), all but one with five times the stated wander or a random walk; no other effect gains more than 6. Of 1,994
+0.28 %), all five with five times the stated wander or a random walk; no other effect gains more than 6. Of 1,994
 units on tables 2 gain more than 16, none more than 20 (0 to 0.18 %), and no other effect more than 6.
 """
 
