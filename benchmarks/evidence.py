@@ -66,7 +66,6 @@ class Stored:
     command: str
     date: str
     commit: str
-    minutes: float
     figures: list[MeasuredFigure]
 
     @classmethod
@@ -107,7 +106,7 @@ def measured(measure: Measure, options: argparse.Namespace) -> Stored:
     """Run a measure; raises ``SystemExit`` where its command writes no figures."""
     git = ["git", "-C", str(ROOT), "rev-parse", "--short=8", "HEAD"]
     commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-    began = time.time()
+    date = time.strftime("%Y-%m-%d", time.gmtime())
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         words = measure.words(folder, options)
@@ -116,8 +115,7 @@ def measured(measure: Measure, options: argparse.Namespace) -> Stored:
         if not file.is_file():
             raise SystemExit(f"{shlex.join(words)} wrote no figures:\n{run.stdout[-1000:]}{run.stderr[-2000:]}")
         figures = [MeasuredFigure.from_json(entry) for entry in json.loads(file.read_text(encoding="utf-8"))]
-    date = time.strftime("%Y-%m-%d", time.gmtime(began))
-    return Stored(measure.shown, date, commit, round((time.time() - began) / 60.0, 1), figures)
+    return Stored(measure.shown, date, commit, figures)
 
 
 def outside(stored: Stored, part: Stored) -> list[str]:
@@ -196,8 +194,9 @@ def main() -> int:
         return 0
     known, wrong = measures(), []
     for name in options.names or known:
+        began = time.time()
         found = measured(known[name], options)
-        print(f"{name}: {found.minutes:.1f} min", flush=True)
+        print(f"{name}: {(time.time() - began) / 60.0:.1f} min", flush=True)
         for figure in found.figures:
             print(
                 "  " + " ".join(str(cell) for cell in figure.cells) + (" MISSED" if figure.missed else ""), flush=True

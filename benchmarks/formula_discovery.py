@@ -37,8 +37,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from imu_research.figures import MeasuredFigure, wilson, write_figures
+from imu_research.figures import share, write_figures
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import CYCLE_DEGC, NOISES, StudyCase, draw
 from imu_research.study.run import held_out_errors
@@ -294,18 +295,15 @@ def main() -> None:
                 print(f"\r{len(lines)} of {arguments.n}", end="", file=sys.stderr)
     print()
     if arguments.what == "hidden":
-        found = _share("exact form", [line["exact"] for line in lines], ">= 60 %")
-        found += _share("held-out error at the floor", [line["floor"] for line in lines])
+        found = share("exact form", pd.Series([line["exact"] for line in lines], dtype=bool), ">= 60 %")
+        found += share("held-out error at the floor", pd.Series([line["floor"] for line in lines], dtype=bool))
     else:
-        found = _share("units with an invented formula", [bool(n["invented"]) for n in lines if n["judged"]], "<= 1 %")
+        invented = pd.Series([bool(n["invented"]) for n in lines if n["judged"]], dtype=bool)
+        found = share("units with an invented formula", invented, "<= 1 %")
+    for figure in found:
+        print(*figure.cells)
     if arguments.figures:
         write_figures(arguments.figures, found)
-
-
-def _share(name: str, hits: list[bool], goal: str = "") -> list[MeasuredFigure]:
-    low, high = wilson(sum(hits), len(hits))
-    print(f"{name}: {sum(hits)} of {len(hits)}, 95 % interval {100 * low:.1f} to {100 * high:.1f} %")
-    return [MeasuredFigure(name, sum(hits) / len(hits), len(hits), goal, (low, high))]
 
 
 if __name__ == "__main__":

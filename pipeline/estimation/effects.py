@@ -179,7 +179,7 @@ def fit_effects_by_rests(
     if len(fitted.residual) <= fitted.rank:
         raise NotObservableError(
             f"{len(model.rests.time)} rests of the {sensor} are too few for {', '.join(names)} in addition to bias and "
-            f"matrix: record at least {fitted.rank + 10} rests in as many orientations"
+            f"matrix: {fitted.more_rests}"
         )
     require_observable(model, fitted, limits)
     return calibration_of(model, fitted, before, settings, other)

@@ -155,8 +155,8 @@ def left_out(
     models = [part for part, _ in parts]
     others = [model.without(~held) for _, held in parts] if isinstance(model, GyroscopeModel) else []
     moving = bool(others) and all(part.moves is not None for part in others)
+    equations = min(len(part.equations(selection.base.state).residual) for part in models)  # as many with any effects
     for count, each in enumerate(selection.fits):
-        equations = min(len(part.equations(each.state).residual) for part in models)
         judged.append(equations >= each.rank + SPARE)
         if equations <= each.rank:
             continue

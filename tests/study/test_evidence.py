@@ -59,7 +59,7 @@ def test_each_stored_figure_has_its_command_date_and_commit(evidence: ModuleType
 
 def test_a_part_that_contradicts_the_stored_share_is_named(evidence: ModuleType) -> None:
     def of(*figures: MeasuredFigure) -> object:
-        return evidence.Stored("", "", "", 0.0, list(figures))
+        return evidence.Stored("", "", "", list(figures))
 
     whole = of(MeasuredFigure("a", 0.99, 1000, "", (0.98, 1.0)), MeasuredFigure("b", 30.0, 1, unit="ms"))
     agrees = of(MeasuredFigure("a", 0.95, 20, "", (0.8, 1.0)), MeasuredFigure("b", 60.0, 1, unit="ms"))
@@ -78,7 +78,7 @@ def test_a_command_that_writes_no_figures_ends_with_its_message(evidence: Module
 def test_a_tenth_of_everything_agrees_with_what_is_stored(
     evidence: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """All measures but those that need other programs, 15 minutes on two cores."""
+    """All measures but those that need other programs."""
     names = [name for name in evidence.measures() if name not in {"peers", "real"}]
     monkeypatch.setattr(sys, "argv", ["evidence.py", "run", *names, "--share", "0.1"])
     assert evidence.main() == 0, capsys.readouterr().out

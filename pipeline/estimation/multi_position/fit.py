@@ -62,6 +62,7 @@ if TYPE_CHECKING:
 # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 MAX_STEP_HALVINGS = 30  # of a step; a smaller one is rounding
 MIN_NEW_NORM_SHARE = 1e-3
+REDUNDANT_RESTS = 10  # that are recommended beyond the parameters, so that residuals show the noise
 NEGLIGIBLE_LOG_LIKELIHOOD = 12.0  # of log L below the best: a weight of 6e-6
 PREDICTED_TO = 4.0  # of log L by a linear model: 9 of 10 fits of 13 simulated units differ by less than 0.5
 CEILING_TO = 1.0  # of log L without a residual, which changes by up to 0.02 between fits of these units
@@ -279,6 +280,11 @@ class FitByHand:
     def rank(self) -> int:
         """Number of combinations of parameters that the equations determine."""
         return self._every[1][self._likeliest].rank
+
+    @property
+    def more_rests(self) -> str:
+        """What to record where the rests do not determine the parameters."""
+        return f"record at least {self.rank + REDUNDANT_RESTS} rests in as many orientations"
 
     @property
     def condition(self) -> float:

@@ -256,8 +256,8 @@ def _too_few(selection: SelectionByHand, case: DiagnosisInput) -> dict[str, str]
     used = rests - sum(map(len, held_out_rests(case.recordings, case.settings.procedure).values()))
     pairs = zip(selection.names, selection.fits[1:], strict=True)
     return {
-        name: f"the {used} rests of the fit are too few for it: record at least {fit.rank + 10} rests in as many "
-        "orientations, or hold none out (procedure.holdout_every=0)"
+        name: f"the {used} rests of the fit are too few for it: {fit.more_rests}, or hold none out "
+        "(procedure.holdout_every=0)"
         for name, fit in pairs
         if len(fit.residual) * used <= fit.rank * rests
     }
