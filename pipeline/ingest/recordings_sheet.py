@@ -77,7 +77,7 @@ def sheet_of_mapping(recordings: Mapping[str, object]) -> dict[str, RecordingFil
     sheet = recordings.get(SHEET)
     as_csv = getattr(sheet, "to_csv", None)
     if as_csv is not None:
-        return _recordings_of(str(as_csv(index=False)), f"{SHEET} (DataFrame)")
+        return recordings_of_text(str(as_csv(index=False)), f"{SHEET} (DataFrame)")
     if not isinstance(sheet, str | os.PathLike):
         message = f"recordings: no sheet: name its path or a DataFrame {SHEET!r}, with columns {', '.join(COLUMNS)}"
         raise MissingInputError(f"{message}; {HINT}")
@@ -96,11 +96,11 @@ def read_sheet(path: Path) -> dict[str, RecordingFile]:
         text = read_text(path, LARGEST, "the sheet of recordings")
     except ConfigurationError as error:
         raise IngestError(error.message, str(path), code="sheet", hint=HINT) from None
-    return _recordings_of(text, str(path))
+    return recordings_of_text(text, str(path))
 
 
-def _recordings_of(text: str, path: str) -> dict[str, RecordingFile]:
-    """Return the recordings of the text of a sheet; ``path`` stands for it in errors."""
+def recordings_of_text(text: str, path: str) -> dict[str, RecordingFile]:
+    """Return the recordings of the text of a sheet, by name; ``path`` stands for it in errors."""
     entries = [(line, _entry(row, path, line)) for line, row in _rows(text, path)]
     if not entries:
         raise _refusal("no row names a file", path, 1)

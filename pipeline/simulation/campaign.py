@@ -40,6 +40,7 @@ from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import AXES, SENSORS, Recording, continuous
 from pipeline.core.settings import ProgramRest, Repeated
 from pipeline.ingest.arrow import write_recording
+from pipeline.ingest.recordings_sheet import COLUMNS, SHEET
 from pipeline.physics.kinematics import earth_of
 from pipeline.simulation.description import (
     BY_FILE,
@@ -73,6 +74,7 @@ ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3  # of CSV fi
 MARGIN_S = 2.0  # by which a separate log begins earlier and ends later than the recording
 LARGEST_OFFSET_S, DRIFT_PPM = 100.0, 50.0  # of a random clock; the drift is the standard deviation of quartz clocks
 NO_TABLE: dict[str, Any] = {"table_angle": None, "table_rate": None, "table_attitude": None}
+SHEET_FILE = f"{SHEET}.csv"
 INGEST = "table_log"  # configs/ingest that reads a separate log
 COMMENT = "# The table has no encoders: its program instead of its log. Written by python -m pipeline simulate.\n"
 UNITS_CSV_COLUMNS = (
@@ -98,7 +100,7 @@ class Environment:
         T(t) = ambient + warm_up (1 - exp(-t / warm_up_time)) + drift sum_k sin(2 pi t / p_k + phase_k) / 2 + ramp(t)
 
     where p_k are the two ``periods`` of the room, half an hour to two hours, and ``ramp(t)`` is the triangle of a
-    thermal chamber: up, down below the room, and back.
+    thermal chamber: up, down below the room, and back; without end, or once in each of the ``soaks``.
     """
 
     ambient: float
@@ -109,12 +111,16 @@ class Environment:
     phases: Values
     ramp: float = 0.0
     ramp_period: float = 3600.0
+    soaks: tuple[tuple[float, float], ...] = ()  # s, start and end of each
     noise: float = 0.03
 
     def temperature(self, time: Values) -> Values:
         """Return the true temperature: (n,) array, degC; time in s since power-on."""
         room = np.sin(2.0 * np.pi * time[:, None] / self.periods + self.phases).sum(1) / 2.0
-        triangle = 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * time / self.ramp_period))
+        phase = np.zeros(len(time)) if self.soaks else time / self.ramp_period
+        for start, end in self.soaks:
+            phase = phase + np.clip((time - start) / (end - start), 0.0, 1.0)
+        triangle = 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * phase))
         warm = self.warm_up * (1.0 - np.exp(-time / self.warm_up_time))
         total: Values = self.ambient + warm + self.drift * room + self.ramp * triangle
         return total
@@ -184,6 +190,7 @@ def record(
             None if recording.axis is None else AXES[recording.axis],
             times[k],
             temperature=np.round(environment.reading(time, rng["temperature"]), TEMPERATURE_DECIMALS),
+            kind=recording.kind,
             **readings,
             **_log(recording, bench, time - time[0]),
         )
@@ -396,6 +403,8 @@ def write_campaign(
         folder.mkdir(parents=True, exist_ok=True)
         for recording in recordings:
             _write_recording(folder, recording, unit.format, sensor_model)
+        if sheet := sheet_of(unit):
+            (folder / SHEET_FILE).write_text(sheet, encoding="utf-8")
         path = directory / "truth" / f"{unit.unit}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({**truth, "unit": unit.unit}, indent=1) + "\n", encoding="utf-8")
@@ -439,14 +448,23 @@ def simulate_unit(
     mover = streams["motion"] if unit.motion is None else Streams(seed, unit.motion)["motion"]
     planned = [*_selected(unit, plan(unit.procedure, course, mover, by_hand)), *extra]
     total = sum(p.trajectory.duration + course.pause_s for p in planned)
-    ramp = course.thermal_ramp_degc if unit.procedure == "thermal_ramp" else 0.0
-    of_ramp = {"ramp": ramp, "ramp_period": total / 1.5}
-    environment = replace(random_environment(streams["room"]), **{**of_ramp, **unit.temperature})
     pause = unit.interval_s if unit.procedure == ONE_RECORDING else course.pause_s
+    times = zip(planned, _times(planned, unit.interval_s, pause), strict=True)
+    soaks = tuple((t[0] / NANOSECONDS, t[-1] / NANOSECONDS) for p, t in times if p.kind == "soak")
+    ramp = course.thermal_ramp_degc if soaks or unit.procedure == "thermal_ramp" else 0.0
+    of_ramp = {"ramp": ramp, "ramp_period": total / 1.5, "soaks": soaks}
+    environment = replace(random_environment(streams["room"]), **{**of_ramp, **unit.temperature})
     truth = true_parameters(unit, seed, number)
     made = record(planned, benches, effects, environment=environment, unit=unit, pause=pause, streams=streams)
     recordings, clock = with_table_log(unit, planned, made, streams["link"])
     return recordings, truth | ({"table_clock": clock} if clock else {})
+
+
+def sheet_of(unit: UnitDescription) -> str:
+    """Return the sheet of a unit's recordings, as CSV; empty where its procedure has none."""
+    planned = _selected(unit, plan(unit.procedure, course_of(unit), np.random.default_rng(0)))
+    rows = [f"{p.name}.{unit.format},{p.row}" for p in planned if p.row]
+    return "\n".join([",".join(COLUMNS), *rows, ""]) if rows else ""
 
 
 def true_parameters(unit: UnitDescription, seed: int, number: int) -> dict[str, Any]:

@@ -21,6 +21,8 @@ Plan the recordings of a procedure: the program of the table, or the attitudes a
 for the accelerometer, turns at one or several rates between rests for the gyroscope; then held-out random motion and a
 long rest. ``orientations_24`` (Sudsanguan 2018): eight rests 45 deg apart about each axis. ``six_positions``: each axis
 up and down. ``multi_position``: rests in random attitudes. ``ferraris``: six faces up, then turns about each axis.
+``listed``: the ``kinds`` of the course: a rest, rests and moves as in ``multi_position``, two turns about each axis,
+one of them held out, and soaks in a thermal chamber, each in another attitude.
 """
 
 from __future__ import annotations
@@ -129,7 +131,10 @@ class Course(Described):
     static_s: NonNegative = 120.0  # length of the long rest; 0: none
     pause_s: NonNegative = 30.0  # between recordings, and before the first
     positions: Annotated[int, Field(ge=2)] = 40  # rests of multi_position
-    thermal_ramp_degc: NonNegative = 15.0  # amplitude of the chamber's ramp in thermal_ramp
+    thermal_ramp_degc: NonNegative = 15.0  # amplitude of the chamber's ramp in thermal_ramp and in each soak
+    kinds: tuple[Literal["rest", "moves", "turn", "soak"], ...] = ("rest", "moves", "turn", "soak")  # of listed
+    soaks: Annotated[int, Field(ge=1)] = 1  # attitudes in which listed soaks the unit
+    soak_s: Positive = 3600.0  # length of each: up by the ramp, down below the room, and back
     turn_error_deg: NonNegative = 3.0  # by hand in ferraris, standard deviation of the total angle of each turn
     turn_axis_error_deg: NonNegative = 1.5  # and of each of the two angles between a body axis and the turns about it
 
@@ -157,15 +162,11 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
         "six_positions": six_positions,
         "multi_position": lambda: random_attitudes(course.positions, rng),
     }
-    if procedure not in {*attitudes, FERRARIS}:
-        known = ", ".join((*TABLE_PROCEDURES, *attitudes, FERRARIS))
-        message = f"no procedure is called {procedure!r}; known: {known}"
-        if procedure == OF_A_SHEET:
-            message = (
-                "procedure listed is for recordings that exist, and has no course to plan or simulate; take the one "
-                f"nearest to them, as ferraris for turns by hand and multi_position for rests; known: {known}"
-            )
-        raise ConfigurationError(message)
+    if procedure not in {*attitudes, FERRARIS, OF_A_SHEET}:
+        known = ", ".join((*TABLE_PROCEDURES, *attitudes, FERRARIS, OF_A_SHEET))
+        raise ConfigurationError(f"no procedure is called {procedure!r}; known: {known}")
+    if procedure == OF_A_SHEET:
+        return _listed(course, rng, hand_accuracy)
     if procedure == FERRARIS:
         moves = _faces_and_turns(course, rng, hand_accuracy)
     else:
@@ -190,7 +191,7 @@ def fit_to_samples(procedure: str, course: Course, samples: int, interval: float
     def stretched(step: float, factor: float) -> Course:
         stretch = {
             name: factor * getattr(course, name)
-            for name in ("dwell_s", "rest_s", "warm_up_rest_s", "validation_s", "static_s")
+            for name in ("dwell_s", "rest_s", "warm_up_rest_s", "validation_s", "static_s", "soak_s")
         }
         return replace(course, step_deg=step, **stretch)
 
@@ -293,10 +294,36 @@ def _faces_and_turns(course: Course, rng: np.random.Generator, accuracy: float) 
     return RestsAndMoves(Program(steps), np.array(axes), start)
 
 
+def _listed(course: Course, rng: np.random.Generator, accuracy: float) -> list[Planned]:
+    """Return the recordings of a sheet: those of the course's ``kinds``."""
+    planned, short = _static(course), replace(course, warm_up_rest_s=0.0)
+    found = [replace(p, name="still", role="rests", row="rest") for p in planned if "rest" in course.kinds]
+    if "moves" in course.kinds:
+        moves = _rests(random_attitudes(course.positions, rng), short, rng, accuracy)
+        found.append(Planned("moves", "rests", None, moves, "moves"))
+    for axis, held_out in product(range(3), (False, True)) if "turn" in course.kinds else ():
+        angle, off = 360.0 * course.turns, np.radians(course.turn_axis_error_deg) * rng.standard_normal(3)
+        about = np.eye(3)[axis] + np.where(np.arange(3) == axis, 0.0, off)
+        true = angle + course.turn_error_deg * float(rng.standard_normal())
+        moved = turn(true, course.rates_dps[0], course.acceleration_dps2)
+        steps = Program([rest(course.dwell_s), moved, rest(course.dwell_s)])
+        trajectory = RestsAndMoves(steps, about[None] / np.linalg.norm(about), random_attitudes(1, rng)[0])
+        row = f"turn,{AXES[axis]},{angle:g},{course.turn_error_deg or ''},{'yes' if held_out else ''}"
+        name = f"turn_{AXES[axis]}{'_held_out' if held_out else ''}"
+        found.append(Planned(name, "validation" if held_out else "rests", None, trajectory, row))
+    soaked = six_positions()[: course.soaks] if course.soaks <= 6 else random_attitudes(course.soaks, rng)
+    for number, attitude in enumerate(soaked if "soak" in course.kinds else (), 1):
+        still = RestsAndMoves(Program([rest(course.soak_s)]), np.eye(3)[:1], attitude)
+        found.append(Planned(f"soak_{number}", "rests", None, still, "soak"))
+    return found
+
+
 # By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
 COURSE_BY_HAND = Course(dwell_s=REST_BY_HAND_S, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
 # Each turn there and back, the second held out between rests of 4 s or longer; 360 deg in some 3 s.
 FACES_AND_TURNS = replace(COURSE_BY_HAND, dwell_s=5.0, rates_dps=(120.0,), both_directions=True)
+# From 24 attitudes both sensors are determined. Chambers and freezers: about 60 degC in all.
+COURSE_OF_SHEET = replace(FACES_AND_TURNS, positions=24, thermal_ramp_degc=30.0)
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -369,7 +396,7 @@ class UnitDescription(Described):
 
     def whole_course(self) -> Course:
         """Return how the procedure is run, with its default lengths."""
-        base = FACES_AND_TURNS if self.procedure == FERRARIS else COURSE_BY_HAND
+        base = {FERRARIS: FACES_AND_TURNS, OF_A_SHEET: COURSE_OF_SHEET}.get(self.procedure, COURSE_BY_HAND)
         return replace(Course() if self.procedure in TABLE_PROCEDURES else base, **self.course)
 
 
@@ -512,10 +539,11 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--static", dest="static_s", type=float, metavar="S", help="length of the long rest (120; 0: none)")
     add("--pause", dest="pause_s", type=float, metavar="S", help="between recordings (30)")
     add("--thermal-ramp", dest="thermal_ramp_degc", type=float, metavar="DEGC",
-        help="of thermal_ramp: up and down (15)")  # fmt: skip
-    add(
-        "--turn-error", dest="turn_error_deg", type=float, metavar="DEG", help="of a hand's total angle in ferraris (3)"
-    )
+        help="of thermal_ramp (15) and of each soak (30): up and down")  # fmt: skip
+    add("--kinds", nargs="+", metavar="KIND", help="recordings of listed: rest, moves, turn, soak (all)")
+    add("--soaks", type=int, metavar="N", help="attitudes in which listed soaks the unit in a thermal chamber (1)")
+    add("--soak", dest="soak_s", type=float, metavar="S", help="length of each (3600)")
+    add("--turn-error", dest="turn_error_deg", type=float, metavar="DEG", help="of a hand's total angle (3)")
     add("--turn-axis-error", dest="turn_axis_error_deg", type=float, metavar="DEG", help="of its turn axis (1.5)")
 
 

@@ -306,12 +306,21 @@ def _growth(u: Values) -> Values:
 
 @dataclass(frozen=True)
 class Planned:
-    """One recording to simulate: its name, role, turn axis (index or None) and trajectory."""
+    """One recording to simulate: its name, role, turn axis (index or None) and trajectory.
+
+    ``row``: its cells in a sheet of recordings behind the file; empty for a procedure without a sheet.
+    """
 
     name: str
     role: str
     axis: int | None
     trajectory: CommandedTurns | RestsAndMoves | Gimbals
+    row: str = ""
+
+    @property
+    def kind(self) -> str:
+        """Kind of the recording in the sheet."""
+        return self.row.partition(",")[0]
 
 
 def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator) -> Gimbals:

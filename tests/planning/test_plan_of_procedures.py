@@ -113,6 +113,12 @@ def test_a_course_that_cannot_be_run_is_refused(course: dict[str, Any], message:
         plan_of(replace(ONE_WAY, course=course))
 
 
-def test_a_sheet_of_recordings_has_no_course_and_the_nearest_procedure_is_named() -> None:
-    with pytest.raises(ConfigurationError, match="take the one nearest to them, as ferraris for turns by hand"):
-        plan_of(replace(ONE_WAY, procedure="listed", table="hand", course={}))
+def test_a_chamber_shows_the_effects_of_temperature() -> None:
+    course = {"kinds": ["rest", "turn"], "soak_s": 600.0, "static_s": 30.0}
+    without = UnitDescription("U", procedure="listed", table="hand", interval_s=0.1, course=course)
+    chamber = replace(without, course={**course, "kinds": ["rest", "turn", "soak"]})
+    plans = [of_sensor("gyroscope", simulate_procedure(unit), half_only=True) for unit in (without, chamber)]
+    warming, soaked = map(_sizes, plans)
+    assert {"bias_temperature_cubic", "temperature_lag"} <= soaked.keys() - warming.keys()
+    assert soaked["bias_temperature"] < 0.1 * warming["bias_temperature"]  # 60 degC against the 5 of the warm-up
+    assert {change.options for change in changes(chamber)} >= {"--soaks 2", "--dwell 10"}

@@ -349,6 +349,21 @@ def test_the_demo_s_home_made_table_is_off_and_its_held_out_motion_is_not() -> N
     assert np.std(residual(recordings["validation"], precise, "gyroscope")) < 0.013
 
 
+def test_a_simulated_sheet_names_its_files_and_the_chamber_ramps_in_its_soaks_alone(tmp_path: Path) -> None:
+    course = {"positions": 10, "soak_s": 300.0, "soaks": 2, "static_s": 20.0}
+    unit = {"unit": "U", "procedure": "listed", "table": "hand", "interval_s": 0.1, "course": course}
+    write_campaign(description_from({"units": [unit]}, "test"), tmp_path)
+    settings = load_campaign({"campaign": str(tmp_path)}).units["U"].config
+    listed = settings.procedure.recordings
+    turns = [f"turn_{axis}{end}" for axis in "xyz" for end in ("", "_held_out")]
+    assert list(listed) == ["still", "moves", *turns, "soak_1", "soak_2"]
+    assert {name for name, entry in listed.items() if entry.role == "validation"} == set(turns[1::2])
+    for r in read_recordings(settings.procedure, settings.ingest, settings.sensor, tmp_path / "raw" / "U"):
+        assert r.temperature is not None
+        low, high = np.ptp(r.temperature[: r.samples // 2]), np.ptp(r.temperature)
+        assert (29.0 < low < 35.0 and 58.0 < high < 65.0) if r.kind == "soak" else high < 6.0
+
+
 def test_a_turn_by_hand_has_one_accuracy() -> None:
     course, said = Course(), re.search(r"a multiple of it; its uncertainty \| 360, (\S+) \|", RECORD.read_text())
     assert said

@@ -64,7 +64,9 @@ def main(argv: Sequence[str]) -> int:
     unit = UnitDescription(arguments.unit, **bench)
     sheet = procedure.get("sheet")
     text = (
-        template("listed_readme.md").render(unit=arguments.unit, turn_deg=f"{procedure['turns']['accuracy_deg']:g}")
+        template("listed_readme.md").render(
+            unit=arguments.unit, sensor=sensor_name, turn_deg=f"{procedure['turns']['accuracy_deg']:g}"
+        )
         if sheet
         else readme(unit, arguments.directory.resolve().name)
     )

@@ -37,13 +37,22 @@ from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
 from pipeline.evaluation.diagnosis.multi_position import require_model
 from pipeline.evaluation.diagnosis.observability import at_its_limit, not_observable, not_observable_by_hand
+from pipeline.ingest.recordings_sheet import recordings_of_text
 from pipeline.output.pages.pages import template
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import Owner, unit_of
 from pipeline.physics.kinematics import LEVEL_AT_ZERO
 from pipeline.physics.signal.rests import SETTLING_S
-from pipeline.simulation.campaign import simulate_unit
-from pipeline.simulation.description import TABLE_PROCEDURES, Course, UnitDescription, course_of, plan, shipped_settings
+from pipeline.simulation.campaign import SHEET_FILE, sheet_of, simulate_unit
+from pipeline.simulation.description import (
+    OF_A_SHEET,
+    TABLE_PROCEDURES,
+    Course,
+    UnitDescription,
+    course_of,
+    plan,
+    shipped_settings,
+)
 from pipeline.simulation.trajectory import Gimbals, Planned, random_gimbals
 from pipeline.unit import run_checked
 
@@ -215,6 +224,9 @@ def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> 
     )
     recordings, _ = simulate_unit(faultless, SEED, 0, extra)
     settings = shipped_settings(sensor=unit.sensor, table=unit.table, procedure=unit.procedure)
+    if sheet := sheet_of(unit):
+        listed = settings.procedure.replaced(recordings=recordings_of_text(sheet, SHEET_FILE))
+        settings = settings.replaced(procedure=listed)
     long_rest = any(recording.role == "static" for recording in recordings)
     noise = {s: stated_noise(settings.sensor.of(s), unit.interval_s, long_rest=long_rest) for s in SENSORS}
     minutes = max(float(r.time[-1]) for r in recordings) / 60.0
@@ -344,13 +356,13 @@ def changes(unit: UnitDescription) -> list[ProcedureChange]:
 
     if on_table and not course.both_directions:
         propose("make every turn in the other direction too", "--both-directions", both_directions=True)
-    faster = [r for r in FASTER_DPS if CLEARLY_FASTER * max(course.rates_dps) < r <= USABLE_RANGE_SHARE * full]
-    if on_table and faster:
+    faster = [
+        r for r in FASTER_DPS * on_table if CLEARLY_FASTER * max(course.rates_dps) < r <= USABLE_RANGE_SHARE * full
+    ]
+    if faster:
         rates = (*course.rates_dps, *faster)
         what = f"turn at {' and '.join(f'{r:g}' for r in faster)} deg/s too, both sensors recorded"
         propose(what, "--rate " + " ".join(f"{r:g}" for r in rates), rates_dps=rates)
-    if on_table:
-        propose("make twice as many turns", f"--turns {2 * course.turns}", turns=2 * course.turns)
     if not (on_table and course.accelerometer_rates_dps):
         dwell = 2.0 * course.dwell_s
         propose("rest twice as long at each stop", f"--dwell {dwell:g}", dwell_s=dwell)
@@ -358,7 +370,10 @@ def changes(unit: UnitDescription) -> list[ProcedureChange]:
         what = f"heat and cool the unit by {course.thermal_ramp_degc:g} degC meanwhile, in a thermal chamber"
         found.append(ProcedureChange(what, "--procedure thermal_ramp", replace(fixed, procedure="thermal_ramp")))
     if on_table:
+        propose("make twice as many turns", f"--turns {2 * course.turns}", turns=2 * course.turns)
         found += _further(fixed, course, full)
+    elif unit.procedure == OF_A_SHEET:
+        propose("soak the unit in one more attitude", f"--soaks {course.soaks + 1}", soaks=course.soaks + 1)
     elif unit.procedure == "multi_position":
         more = POSITIONS * course.positions
         propose(f"rest in {more} positions", f"--positions {more}", positions=more)
