@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from imu_logs.units import SENSORS
 from pipeline.app.config.options import GIVEN, effects_for
-from pipeline.core.files import CONFIGS, canonical_json
+from pipeline.core.files import CONFIGS, canonical_json, state_of_files
 from pipeline.core.settings import OF_BENCH, Board, Settings, Stated, Unit
+from pipeline.core.user_cache import from_cache, to_cache
 from pipeline.ingest.files import state_of_recordings
 from pipeline.output.history import digest
 from pipeline.unit import EFFECTS_STAGE, STEPS
@@ -218,13 +219,23 @@ def code_digest(*modules: str) -> str:
     It includes all files of a package that imports its modules by name, the folder ``templates`` of a module that
     imports jinja2, and ``configs/effect/`` with the effects.
     """
+    name, state = "-".join(("code", *modules)), _state_of_sources()
+    if (known := from_cache(name, state)) is not None:
+        return str(known)
     files = frozenset[Path]().union(*map(_closure, modules))
     if any(module.startswith("pipeline.app.steps.") for module in modules):
         files |= _closure("pipeline.app.steps.unit_files")  # loads and stores what the step reads and returns
     digest = hashlib.sha256()
     for file in sorted(files):
         digest.update(str(file.relative_to(PACKAGE.parent)).encode() + b"\0" + file.read_bytes())
+    to_cache(name, state, digest.hexdigest()[:16])
     return digest.hexdigest()[:16]
+
+
+@cache
+def _state_of_sources() -> str:
+    folders = (*(PACKAGE.parent / package for package in PACKAGES), EFFECTS_FOLDER)
+    return state_of_files(f for folder in folders for f in folder.rglob("*") if f.suffix and f.suffix != ".pyc")
 
 
 @cache
