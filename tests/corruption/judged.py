@@ -66,7 +66,7 @@ def judge(copy: Copy, results: Path) -> list[Judgement]:
     if calibration["status"] != "ok":
         error = calibration["error"] or {}
         return [_judged(copy, s, REFUSED, error.get("code", ""), (), str(error.get("message"))) for s in copy.truth]
-    turns = _turns(copy, calibration["methods"])
+    turns = _turns(copy, calibration)
     out = []
     for sensor in copy.truth:
         found, held, said = (document.get(sensor) for document in (calibration, validation, diagnosis))
@@ -138,13 +138,16 @@ def _is_cause(said: Any, known: set[str]) -> bool:
     return bool(({first} | alike) & known)
 
 
-def _turns(copy: Copy, methods: dict[str, str]) -> dict[str, np.ndarray]:
+def _turns(copy: Copy, calibration: dict[str, Any]) -> dict[str, np.ndarray]:
     """Return by which rotation the true matrices differ from the frame of a method that needs no table.
 
     Its x of the sensor is x of the body, and y lies in the plane of both: the accelerometer's matrix is lower
-    triangular, with a positive diagonal. The gyroscope's is in that frame where it is found from the same moves.
+    triangular, with a positive diagonal. The gyroscope's is in that frame where it is found from the same moves. On a
+    table the fit of effects replaces the matrix by that in the frame of the turns.
     """
-    free = methods["accelerometer"] == "nonlinear_least_squares"
+    methods = calibration["methods"]
+    in_turns = calibration["table"] != "hand" and any((calibration["accelerometer"] or {}).get("effects", []))
+    free = methods["accelerometer"] == "nonlinear_least_squares" and not in_turns
     turn = np.eye(3)
     if free:
         q, r = np.linalg.qr(copy.truth["accelerometer"].matrix[:, ::-1])

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from all_ways import single_ways
-from judged import RIGHT, SILENT
+from judged import RIGHT, SILENT, judge
 from run import drawn, run
-from unit_copy import Copy, NotApplicableError
+from unit_copy import Copy, NotApplicableError, Truth
 from ways_of_benches import exchanged_files
 from whole_run import run_campaign
 
@@ -47,6 +48,26 @@ def test_an_exchange_with_a_recording_that_the_unit_lacks_is_not_applicable(firs
     with pytest.raises(NotApplicableError, match="no static"):
         exchanged_files(Copy("C1", "U1", "mpu6050", "csv", 0.01, tables, {}), first, second)
     assert list(tables) == ["accel_x"]
+
+
+@pytest.mark.parametrize(("effects", "outcome"), [([{"name": "quadratic_nonlinearity"}], RIGHT), ([], SILENT)])
+def test_on_a_table_a_fit_of_effects_is_in_the_frame_of_the_turns(
+    tmp_path: Path, effects: list[dict[str, str]], outcome: str
+) -> None:
+    matrix, U = np.eye(3) + 0.01 * np.eye(3, k=1), np.full((3, 3), 1e-4)
+    part = {"bias": [0.0] * 3, "matrix": matrix.tolist(), "effects": effects}
+    part["expanded_uncertainty"] = {"bias": U[0].tolist(), "matrix": U.tolist()}
+    methods = {"accelerometer": "nonlinear_least_squares", "gyroscope": "staged"}
+    calibration = {"status": "ok", "table": "acutronic", "methods": methods, "accelerometer": part}
+    documents = {
+        "calibrations": calibration,
+        "diagnoses": {"accelerometer": {"verdict": "nothing_missing", "selected": []}},
+    }
+    for folder, document in (documents | {"validations": {}}).items():
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "C1.json").write_text(json.dumps(document), encoding="utf-8")
+    truth = {"accelerometer": Truth(np.zeros(3), matrix)}
+    assert [j.outcome for j in judge(Copy("C1", "U1", "mpu6050", "csv", 0.01, {}, truth), tmp_path)] == [outcome]
 
 
 @pytest.mark.corruption
