@@ -209,6 +209,7 @@ class StageDetails:
     rests_held_out: Sequence[RestUse] | None = None
     known_by_limit: Mapping[str, float] | None = None  # parameters with a pseudo-observation, each with its u
     scatter_between_rests: float | None = None
+    noise_of_means: float | None = None  # standard deviation of a mean that was recorded as such, by their scatter
     largest_error: float | None = None
     rests_on_faces: Mapping[str, int] | None = None
     face_off_deg: Mapping[str, float] | None = None

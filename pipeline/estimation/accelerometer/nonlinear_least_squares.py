@@ -101,6 +101,7 @@ FALSE_ALARM = 1e-3  # probability that a recording without outliers has one
 SMALLEST_OUTLIER_G = 1e-6  # rests of a noise-free recording are no outliers
 FEWEST_TO_JUDGE = 18  # rests, two for each parameter
 OUTLIER_SHARE = 0.2  # of the rests, the most that are called outliers
+MIN_OWN_SHARE = 0.01  # of the assumed variance of a mean: averages over 100 s
 MAX_COVARIANCE_ROWS = 600  # for which errors are drawn from a covariance
 OF_LENGTH = {
     **NOT_INCLUDED,
@@ -185,6 +186,9 @@ def _fit_triangular(task: StageInput) -> SensorCalibration:
     else:
         determined = partial(_fit_partly, gravity_g=gravity_g, prior=prior, data_sheet=data_sheet)
     solved = determined(rows)
+    if (rows.rests.own > 0.0).all() and solved.spare > 1:
+        rows = _with_noise_of_means(rows, solved)
+        solved = determined(rows)
     while refused := _outlier(rows, solved):
         rows = _without(rows, refused)
         solved = determined(rows)
@@ -203,6 +207,18 @@ def _fit_triangular(task: StageInput) -> SensorCalibration:
         white=PLACED @ np.sum(gain**2, axis=1),
         not_included=OF_LENGTH,
     )
+
+
+def _with_noise_of_means(rows: Orientations, solved: _Solved) -> Orientations:
+    """Return rows of means with the noise that their scatter shows, where that is less than assumed.
+
+    How long a mean was averaged is not known: with the residuals r over the standard deviation d of each, of nu degrees
+    of freedom, the variance of a mean is ``v + (sum r^2 / nu - 1) d^2`` in place of v.
+    """
+    residual, deviation = solved.residual[solved.rows], (solved.fit.error / solved.share)[solved.rows]
+    excess = min(float(residual @ residual) / solved.spare - 1.0, 0.0)
+    own = np.maximum(rows.rests.own + excess * deviation**2, MIN_OWN_SHARE * rows.rests.own)
+    return replace(rows, rests=replace(rows.rests, own=own))
 
 
 def _without(rows: Orientations, refused: Mapping[int, str]) -> Orientations:
@@ -418,6 +434,7 @@ def _stage(rows: Orientations, solved: _Solved, covariance: Values, freedom: flo
         known_by_limit=solved.model.known_by_limit,
         white_noise=float(np.sqrt(np.mean(rows.white**2))),
         scatter_between_rests=solved.between,
+        noise_of_means=float(np.sqrt(np.mean(rows.rests.own))) if np.all(rows.rests.own > 0.0) else None,
         largest_error=float(np.max(np.abs(solved.error))),
         condition=solved.fit.condition,
         cosine=solved.fit.cosine,

@@ -30,7 +30,7 @@ distinguished from one of the scale factor; in several it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -302,7 +302,10 @@ def model_of(
     held = rests_of("accelerometer", recordings, settings.procedure, role=HELD_OUT) or rests.select(rests.held_out)
     used, soaks = parted(rests.select(~rests.held_out))
     faces = faces_of(used, (used.reading - calibration.bias) @ calibration.matrix.T, settings.procedure.faces)
-    by_limit = {name: u for stage in calibration.stages for name, u in (stage.details.known_by_limit or {}).items()}
+    details = [stage.details for stage in calibration.stages]
+    by_limit = {name: u for detail in details for name, u in (detail.known_by_limit or {}).items()}
+    for noise_of_means in (detail.noise_of_means for detail in details if detail.noise_of_means is not None):
+        used = replace(used, own=np.full(len(used.time), noise_of_means**2))
     directions = _directions(calibration)
     return AccelerometerModel(
         used, directions, gravity, noise, held=held, faces=faces, known_by_limit=by_limit, soaks=soaks

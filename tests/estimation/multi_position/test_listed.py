@@ -271,6 +271,23 @@ def test_24_means_calibrate_an_accelerometer_and_25_others_judge_it(tmp_path: Pa
     assert set(np.ravel(result.calibration["accelerometer"]["determined_by"]["matrix"])) == {"recordings"}
 
 
+def test_the_scatter_of_means_states_their_noise_where_it_is_less_than_assumed(tmp_path: Path) -> None:
+    unit, true = Unit(tmp_path, np.random.default_rng(4)), 5e-5  # g; averages over a minute, of a steady sensor
+    up = unit.rng.normal(size=(50, 3))
+    mean = unit.bias["accelerometer"] + up / np.linalg.norm(up, axis=1)[:, None] @ unit.K["accelerometer"].T
+    mean += true * unit.rng.normal(size=(50, 3))
+    header = "accel_x_g,accel_y_g,accel_z_g"
+    np.savetxt(tmp_path / "means.csv", mean, fmt="%.8g", delimiter=",", header=header, comments="")
+    unit.rows.append("means.csv,attitudes,,,,")
+    unit.sheet()
+    found = calibrated(tmp_path).calibration
+    stated = found["accelerometer"]["stages"][0]["details"]["noise_of_means"]
+    assert stated == pytest.approx(true, rel=3.0 / np.sqrt(2.0 * 41))  # 41 degrees of freedom, three deviations
+    assert np.abs(errors(unit, found, "accelerometer")).max() < 1.2
+    # Bias of 50 attitudes on a sphere: 2 sigma sqrt(3 / 50), and half as much again for attitudes at random
+    assert max(found["accelerometer"]["expanded_uncertainty"]["bias"]) < 1.5 * 2.0 * true * np.sqrt(3.0 / 50.0)
+
+
 def test_blocks_of_rows_with_a_label_are_attitudes(tmp_path: Path) -> None:
     unit = Unit(tmp_path, np.random.default_rng(6))
     lines = ["label,accel_x_g,accel_y_g,accel_z_g"]
