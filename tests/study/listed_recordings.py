@@ -13,13 +13,13 @@ import argparse
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 import scipy
 
 import pipeline
-from imu_research.figures import MeasuredFigure, clustered_share, write_figures
+from imu_research.figures import MeasuredFigure, clustered_share, share, write_figures
 
 RATE_HZ = 100.0
 # As the sensor file mpu6050: white noise of a sample, bias wander, its time; limits of bias, scale factor, cross-axis.
@@ -42,7 +42,7 @@ class Unit:
             K = cross * rng.uniform(-1.0, 1.0, (3, 3))
             np.fill_diagonal(K, 1.0 + scale * rng.uniform(-1.0, 1.0, 3))
             self.K[sensor] = K
-        self.extra: Any = None  # what temperature adds, a function of sensor and temperature
+        self.effects: dict[str, dict[str, float]] = {}  # of the gyroscope: the parameters of each
 
     def frame(self) -> np.ndarray:
         """Rotation from the case to the frame of the accelerometer, in which its matrix is lower triangular."""
@@ -55,28 +55,42 @@ class Unit:
         M = np.linalg.inv(self.K[sensor])
         return np.concatenate([self.bias[sensor], (M if in_case else self.frame() @ M).ravel()])
 
-    def read(self, sensor: str, true: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        """Readings of the true motion (n, 3)."""
+    def read(self, sensor: str, true: np.ndarray, offset: np.ndarray, hz: float) -> np.ndarray:
+        """Readings of the true motion (n, 3), ``hz`` times a second."""
         n, rng = len(true), self.rng
-        keep = np.exp(-1.0 / (RATE_HZ * TAU_S))
+        keep = np.exp(-1.0 / (hz * TAU_S))
         drive = rng.normal(size=(n, 3)) * np.sqrt(1.0 - keep**2)
         start = keep * rng.normal(size=(1, 3))
         wander = scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0, zi=start)[0]
-        noise = WHITE[sensor] * rng.normal(size=(n, 3)) + WANDER[sensor] * wander
+        noise = WHITE[sensor] * np.sqrt(hz / RATE_HZ) * rng.normal(size=(n, 3)) + WANDER[sensor] * wander
         return self.bias[sensor] + offset + true @ self.K[sensor].T + noise
 
-    def write(self, name: str, row: str, force: np.ndarray, rate: np.ndarray, sensors: str = "ag") -> None:
-        """Record a file."""
+    def write(
+        self,
+        name: str,
+        row: str,
+        force: np.ndarray,
+        rate: np.ndarray,
+        sensors: str = "ag",
+        *,
+        warmth: np.ndarray | None = None,
+        hz: float = RATE_HZ,
+        between: float = BETWEEN,
+    ) -> None:
+        """Record a file; ``warmth``: (n,), degC, a further column."""
         start = 0.0
-        time = start + np.arange(len(rate)) / RATE_HZ
+        time = start + np.arange(len(rate)) / hz
         readings = []
         if "a" in sensors:
-            readings.append(self.read("accelerometer", force, np.zeros(3)))
+            readings.append(self.read("accelerometer", force, np.zeros(3), hz))
         if "g" in sensors:
-            readings.append(self.read("gyroscope", rate, BETWEEN * self.rng.normal(size=3)))
+            readings.append(self.read("gyroscope", rate, between * self.rng.normal(size=3), hz))
         names = COLUMNS.split(",")
         used = [0, *([1, 2, 3] if "a" in sensors else []), *([4, 5, 6] if "g" in sensors else [])]
         header = ",".join(names[i] for i in used)
+        if warmth is not None:
+            header += ",temperature_degc"
+            readings.append(warmth[:, None] + 0.02 * self.rng.normal(size=(len(warmth), 1)))
         table = np.column_stack([time, *readings])
         np.savetxt(self.folder / f"{name}.csv", table, fmt="%.9g", delimiter=",", header=header, comments="")
         self.rows.append(f"{name}.csv,{row}")
@@ -204,7 +218,35 @@ def slow(unit: Unit) -> None:
     unit.write("slow", "slow,,,,", force + rng.uniform(0.002, 0.02) * shaken, np.zeros((n, 3)), "a")
 
 
+def soak(unit: Unit) -> None:
+    """Soaks of 40 to 90 min in one attitude or two; the gyroscope's bias is linear or cubic, or lags."""
+    rng, hz = unit.rng, 5.0
+    shape = str(rng.choice(["linear", "cubic", "lag"]))
+    b1, b3 = (rng.uniform(low, high, 3) * rng.choice([-1.0, 1.0], 3) for low, high in ((0.005, 0.03), (1e-6, 3e-6)))
+    b3, tau = b3 * (shape == "cubic"), rng.uniform(20.0, 60.0) * (shape == "lag")
+    for number in range(int(rng.integers(1, 3))):
+        n, swing, up = round(rng.uniform(2400.0, 5400.0) * hz), rng.uniform(15.0, 35.0), sphere(rng)
+        phase = 2.0 * np.pi * np.arange(n) / n
+        warm = swing * np.sin(phase)
+        late = (
+            warm - tau * swing * np.cos(phase) * 2.0 * np.pi * hz / n
+        )  # of a slow sine: the die after the thermometer
+        added = late[:, None] * b1 + late[:, None] ** 3 * b3
+        rate = added @ np.linalg.inv(unit.K["gyroscope"]).T  # whose reading is what is added
+        unit.write(f"soak_{number}", "soak,,,,", np.tile(up, (n, 1)), rate, warmth=25.0 + warm, hz=hz, between=0.0)
+    of = {"b_T": b1, "b_T1": b1, "b_T2": np.zeros(3), "b_T3": b3, "b_tau": -tau * b1}
+    effects = {
+        "bias_temperature": ["b_T"],
+        "temperature_lag": ["b_tau"],
+        "bias_temperature_cubic": ["b_T1", "b_T2", "b_T3"],
+    }
+    hidden = {"linear": [0], "cubic": [2], "lag": [0, 1]}[shape]
+    for name in np.array([*effects])[hidden].tolist():
+        unit.effects[name] = {f"{p}_{a}": float(v) for p in effects[name] for a, v in zip("xyz", of[p], strict=True)}
+
+
 KINDS = {
+    "soak": soak,
     "turns": lambda unit: turns(unit, "ag"),
     "turns_gyroscope": lambda unit: turns(unit, "g"),
     "table": lambda unit: table(unit, "ag", "angle"),
@@ -223,6 +265,7 @@ def run(kind: str, seed: int, number: int) -> dict[str, list[tuple[str, float, b
         overrides = ["diagnosis.depth=standard"]
         where = "single_axis" if kind.startswith("table") else "hand"
         overrides += ["table.seat_deg=null"] if where != "hand" else []
+        overrides += ["effects.gyroscope=auto"] if kind == "soak" else []
         found = pipeline.calibrate(
             unit.folder, sensor="mpu6050", table=where, procedure="listed", overrides=overrides
         ).calibration
@@ -239,6 +282,14 @@ def run(kind: str, seed: int, number: int) -> dict[str, list[tuple[str, float, b
         out[sensor] = [
             (n, float(e / u), d == "recordings") for n, e, u, d in zip(names, error, U, by, strict=True) if u > 0.0
         ]
+        if sensor == "gyroscope" and kind == "soak":
+            found_effects = {e["name"]: e["parameters"] for e in part["effects"]}
+            right = found_effects.keys() == unit.effects.keys()
+            out["effects"] = [("named", 0.0 if right else np.inf, True)]
+            for name in found_effects.keys() & unit.effects.keys():
+                for p, true in unit.effects[name].items():
+                    stated = found_effects[name][p]
+                    out[sensor].append((p, (stated["value"] - true) / stated["expanded_uncertainty"], True))
     return out
 
 
@@ -261,13 +312,16 @@ def told(kind: str, units: int, seed: int) -> list[MeasuredFigure]:
     """Print the shares of a kind by sensor and group of parameters; returns those of all parameters."""
     counts: dict[tuple[str, str, str], list[float]] = {}
     by_unit: dict[bool, list[list[bool]]] = {True: [], False: []}
+    named: list[bool] = []  # whether the effects of a soak are named, and no other
     for number in range(units):
         found = run(kind, seed, number)
+        named += [ratio == 0.0 for _, ratio, _ in found.pop("effects", [])]
         for recorded, each in by_unit.items():
             each.append([abs(ratio) <= 1.0 for rows in found.values() for _, ratio, by in rows if by is recorded])
         for sensor, rows in found.items():
             for name, ratio, recorded in rows:
                 group = "bias" if name.startswith("bias") else "scale" if name[-1] == name[-2] else "cross"
+                group = "effect" if name.startswith("b_") else group
                 counts.setdefault((sensor, group, "recordings" if recorded else "sensor_file"), []).append(ratio)
     for (sensor, group, by), ratios in sorted(counts.items()):
         inside = np.abs(ratios) <= 1.0
@@ -275,7 +329,10 @@ def told(kind: str, units: int, seed: int) -> list[MeasuredFigure]:
             f"{kind:16} {sensor:13} {group:6} {by:12} {inside.sum():4d} of {len(ratios):4d} = {inside.mean():.3f}, "
             f"rms error/U {np.sqrt(np.mean(np.square(ratios))):.2f}\n"
         )
+    if named:
+        sys.stdout.write(f"{kind:16} effects named and no other: {sum(named)} of {len(named)}\n")
     return [
+        *share(f"{kind}: effects named, and no other", pd.Series(named, dtype=bool), ">= 95 %"),
         *clustered_share(f"{kind}: determined by the recordings", by_unit[True], "contains 95 %"),
         *clustered_share(f"{kind}: held by the sensor file", by_unit[False], ">= 95 %"),
     ]
