@@ -36,7 +36,7 @@ proportion to the restricted likelihood with the curves, as the covariance is (`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
 from typing import TYPE_CHECKING, TypeVar
@@ -48,7 +48,15 @@ from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
 from pipeline.estimation.engine import ErrorMixture
-from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, stepped
+from pipeline.estimation.multi_position.model import (
+    BIAS_TIME,
+    SLOW_BIAS,
+    Equations,
+    Model,
+    NoiseHypothesis,
+    State,
+    stepped,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -77,6 +85,7 @@ SAME_SCALE = 1e-4  # relative change of the noise's scale below which the weight
 UNDETERMINED_COLUMN_SHARE = 1e-8  # share of its columns below which a combination of parameters is not determined
 SCATTER_FACTORS = (3.0**0.5, 3.0**0.25, 3.0**0.125)  # factors of a scatter, on the way to its maximum
 SHARP = 0.5  # standard deviation of a scatter's logarithm, half a step of the grid
+MIN_TIMES_OF_BIAS = 20.0  # T / tau: with T / (2 tau) independent values a variance is known to sqrt(4 tau / T), 45 %
 RARE = 1e-3  # weight of a level below which it does not change the average
 
 
@@ -450,33 +459,54 @@ def refined(
     Many moves determine their scatter to about a tenth; a grid with factors of 3 or 4 would make the covariance wrong
     by up to such factors. So each scatter is moved to the maximum of the restricted likelihood by decreasing factors.
     If the standard deviation s of its logarithm is then less than half a step of the grid, its levels are ``exp(0, +-s,
-    +-2 s)`` times the maximum; otherwise they are the levels of the grid with weight.
+    +-2 s)`` times the maximum; otherwise they are the levels of the grid with weight. The bias at low frequencies is
+    treated alike, with its correlation time at values by a factor of sqrt(3) apart, where the rests last 20 correlation
+    times and more, as in a soak, and determine its variance to a half.
     """
 
     def restricted(noise: NoiseHypothesis) -> float:
         return solve(equations, noise, *prior).restricted
 
     likelihoods = np.array([restricted(noise) for noise in near])
-    best, top = near[int(np.argmax(likelihoods))], float(likelihoods.max())
-    weight = np.exp(likelihoods - top)
-    for factor in SCATTER_FACTORS:
-        for j in (j for j, level in enumerate(best.levels) if level > 0.0):
-            for other in (best.scaled(j, factor), best.scaled(j, 1.0 / factor)):
-                score = restricted(other)
-                if score > top:
-                    best, top = other, score
+    weight = np.exp(likelihoods - likelihoods.max())
+    best = near[int(np.argmax(likelihoods))]
+    scattered = [j for j, level in enumerate(best.levels) if level > 0.0]
+    best, top = _at_maximum(best, scattered, restricted)
+    biases = [noise.bias for noise in {n.bias: n for n in near}.values()]
+    if best.bias.ratio > 0.0 and equations.length.sum() > MIN_TIMES_OF_BIAS * best.bias.time:
+        best, top = _at_maximum(best, [SLOW_BIAS, BIAS_TIME, *scattered], restricted)
+        biases = []
+        for factor in (1.0 / SCATTER_FACTORS[0], 1.0, SCATTER_FACTORS[0]):
+            other, peak = _at_maximum(best.scaled(BIAS_TIME, factor), [SLOW_BIAS], restricted)
+            factors = _sharp(other, SLOW_BIAS, peak, restricted).tolist() or [1.0]
+            biases += [other.scaled(SLOW_BIAS, f).bias for f in factors]
     levels = []
     for j, level in enumerate(best.levels):
         given = np.array([noise.levels[j] for noise in near])
         chosen = [float(k) for k in np.unique(given) if weight[given == k].sum() > RARE * weight.sum()]
-        if level > 0.0:
-            around = [restricted(best.scaled(j, factor)) for factor in (SCATTER_FACTORS[-1], 1.0 / SCATTER_FACTORS[-1])]
-            bend = (2.0 * top - sum(around)) / np.log(SCATTER_FACTORS[-1]) ** 2
-            if bend > SHARP**-2:
-                chosen = (level * np.exp(np.arange(-2.0, 3.0) / np.sqrt(bend))).tolist()
-        levels.append(chosen)
-    of_each_bias = {n.bias: n for n in near}.values()
-    return [n.at(level) for n in of_each_bias for level in product(*levels)]
+        factors = (level * _sharp(best, j, top, restricted)).tolist() if level > 0.0 else []
+        levels.append(factors or chosen)
+    return [replace(best, bias=bias).at(level) for bias in biases for level in product(*levels)]
+
+
+def _at_maximum(
+    noise: NoiseHypothesis, which: Sequence[int], restricted: Callable[[NoiseHypothesis], float]
+) -> tuple[NoiseHypothesis, float]:
+    """Return a hypothesis with some of its levels at their maximum, in decreasing steps, and log L there."""
+    top = restricted(noise)
+    for step, j in product(SCATTER_FACTORS, which):
+        for other in (noise.scaled(j, step), noise.scaled(j, 1.0 / step)):
+            if (score := restricted(other)) > top:
+                noise, top = other, score
+    return noise, top
+
+
+def _sharp(noise: NoiseHypothesis, j: int, top: float, restricted: Callable[[NoiseHypothesis], float]) -> Values:
+    """Return factors on a level at its maximum, by the curvature of log L there; none where it is flat."""
+    step = SCATTER_FACTORS[-1]
+    around = restricted(noise.scaled(j, step)) + restricted(noise.scaled(j, 1.0 / step))
+    bend = (2.0 * top - around) / np.log(step) ** 2
+    return np.exp(np.arange(-2.0, 3.0) / np.sqrt(bend)) if bend > SHARP**-2 else np.zeros(0)
 
 
 def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, values: Values) -> Solution:

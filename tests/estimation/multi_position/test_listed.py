@@ -304,6 +304,25 @@ def test_blocks_of_rows_with_a_label_are_attitudes(tmp_path: Path) -> None:
     assert np.abs(errors(unit, found, "accelerometer")).max() < 1.2
 
 
+def test_a_long_soak_determines_the_bias_at_low_frequencies(tmp_path: Path) -> None:
+    rng, rate, n, tau = np.random.default_rng(8), 2.0, 10800, 100.0
+    keep, white = np.exp(-1.0 / (rate * tau)), 5e-3 * np.sqrt(rate / 2.0)
+    drive = 3e-3 * np.sqrt(1.0 - keep**2) * rng.normal(size=(n, 3))
+    wander = scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0)
+    time = np.arange(n) / rate
+    warm = 30.0 * np.sin(2.0 * np.pi * time / 5400.0)
+    gyro = np.outer(warm, [0.01, -0.02, 0.03]) + wander + white * rng.normal(size=(n, 3))
+    header = "time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,temperature_degc"
+    table = np.column_stack([time, gyro, 25.0 + warm])
+    np.savetxt(tmp_path / "soak.csv", table, fmt="%.8g", delimiter=",", header=header, comments="")
+    (tmp_path / "recordings.csv").write_text("file,kind\nsoak.csv,soak\n")
+    stages = calibrated(tmp_path, "effects.gyroscope=[bias_temperature]").calibration["gyroscope"]["stages"]
+    details = stages[-1]["details"]
+    found = details["wander_ratio"] ** 2 * details["wander_time_s"]
+    # 27 independent values of each of 3 axes: a variance to sqrt(2 / 81) = 16 %, here within 2.5 times that
+    assert found == pytest.approx((3e-3 / white) ** 2 * tau, rel=0.4)
+
+
 def test_a_soak_shows_bias_over_temperature_to_the_third_power(tmp_path: Path) -> None:
     rng, rate, n = np.random.default_rng(7), 2.0, 5400
     time = np.arange(n) / rate
