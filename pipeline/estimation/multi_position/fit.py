@@ -48,21 +48,12 @@ from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
 from pipeline.estimation.engine import ErrorMixture
-from pipeline.estimation.multi_position.model import (
-    BIAS_TIME,
-    SLOW_BIAS,
-    Equations,
-    Model,
-    NoiseHypothesis,
-    State,
-    stepped,
-)
+from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, stepped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.core.records import Mask, Values
-    from pipeline.estimation.multi_position.model import Equations, NoiseHypothesis
 
     Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
 
@@ -474,12 +465,12 @@ def refined(
     best, top = _at_maximum(best, scattered, restricted)
     biases = [noise.bias for noise in {n.bias: n for n in near}.values()]
     if best.bias.ratio > 0.0 and equations.length.sum() > MIN_TIMES_OF_BIAS * best.bias.time:
-        best, top = _at_maximum(best, [SLOW_BIAS, BIAS_TIME, *scattered], restricted)
+        best, top = _at_maximum(best, [best.SLOW_BIAS, best.BIAS_TIME, *scattered], restricted)
         biases = []
         for factor in (1.0 / SCATTER_FACTORS[0], 1.0, SCATTER_FACTORS[0]):
-            other, peak = _at_maximum(best.scaled(BIAS_TIME, factor), [SLOW_BIAS], restricted)
-            factors = _sharp(other, SLOW_BIAS, peak, restricted).tolist() or [1.0]
-            biases += [other.scaled(SLOW_BIAS, f).bias for f in factors]
+            other, peak = _at_maximum(best.scaled(best.BIAS_TIME, factor), [best.SLOW_BIAS], restricted)
+            factors = _sharp(other, other.SLOW_BIAS, peak, restricted).tolist() or [1.0]
+            biases += [other.scaled(other.SLOW_BIAS, f).bias for f in factors]
     levels = []
     for j, level in enumerate(best.levels):
         given = np.array([noise.levels[j] for noise in near])

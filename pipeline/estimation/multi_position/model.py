@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
 import scipy
@@ -62,7 +62,6 @@ INSTABILITY_FACTORS = 3.0 ** np.arange(-2.0, 3.0)  # of the bias instability of 
 INSTABILITY_RATIOS = (0.1, 0.3, 1.0)  # of bias instability to white noise where none is stated
 START_SCATTERS = (0.0, 1.0, 3.0, 9.0, 27.0)  # of rests, of moves and of directions, for a covariance
 SELECTION_SCATTER = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and of moves, where models are compared
-SLOW_BIAS, BIAS_TIME = -2, -1  # of the bias, beside the numbers of a hypothesis's levels
 # Parameters that are 1 in an ideal sensor; all others are 0.
 ONE = {f"{prefix}{axis}" for axis in "xyz" for prefix in ("scale_factor_", f"matrix_{axis}")}
 
@@ -71,6 +70,8 @@ ONE = {f"{prefix}{axis}" for axis in "xyz" for prefix in ("scale_factor_", f"mat
 class NoiseHypothesis:
     """One hypothesis about the noise."""
 
+    SLOW_BIAS: ClassVar[int] = -2  # the bias at low frequencies, beside the numbers of ``levels``
+    BIAS_TIME: ClassVar[int] = -1  # its correlation time
     bias: Setting  # q, bias over white noise, and its time
     scatter: tuple[float, ...]  # the a_j: of rests, and of moves
     direction: float = 0.0  # c
@@ -100,7 +101,7 @@ class NoiseHypothesis:
         """Return the hypothesis with one of its levels multiplied, or the bias at low frequencies, or its time."""
         if j >= 0:
             return self.at([level * (factor if i == j else 1.0) for i, level in enumerate(self.levels)])
-        if j == SLOW_BIAS:
+        if j == self.SLOW_BIAS:
             return replace(self, bias=self.bias._replace(ratio=self.bias.ratio * factor))
         return replace(self, bias=self.bias._replace(ratio=self.bias.ratio / factor**0.5, time=self.bias.time * factor))
 
