@@ -15,18 +15,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
 from pipeline.estimation.engine import cholesky
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from pipeline.core.records import Index, Values
 
 Pick: TypeAlias = tuple[int, int]  # version and scale of an effect
+# log weight, (m,), mean and standard deviation, (m, k), of the normal components of a mixture
+Mixture: TypeAlias = "tuple[Values, Values, Values]"
 EffectSet: TypeAlias = frozenset[str]
 
 # The prior was chosen on 738 simulated sensors: docs/evidence.md.
@@ -83,13 +85,16 @@ class CandidateProblem:
         return replace(self, products=self.products[kept], prior=self.prior[kept])
 
 
-def excited(products: Values, size: Values, limit: Values, least: float) -> Values:
+def excited(products: Values, size: Values, limit: Values, least: float) -> Values | None:
     """Return the linear map from columns to columns per limit of the parameters, in the excited directions.
 
     ``products``: (k, k), with the base projected out. ``size``: (k,), norm of the columns before the projection.
-    ``least``: smallest share of that norm after the projection.
+    ``least``: smallest share of that norm after the projection. None: all directions are excited, and the map is the
+    limits.
     """
-    values, vectors = np.linalg.eigh(products / np.outer(size, size))
+    values, vectors = np.linalg.eigh(products / (size[:, None] * size))
+    if values[0] > least**2:
+        return None
     kept = vectors[:, values > least**2]
     return np.asarray((kept @ kept.T) * limit / size[:, None] * size)
 
@@ -126,7 +131,7 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
         versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
     products[:, :, -1] += products @ values
     products[:, -1] += values @ products
-    scaled = products.copy()
+    unit, changes = np.ones(len(size)), []
     for name, _, at in columns:
         inner = products[0, at, at]
         if name not in limits:
@@ -134,6 +139,12 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
             limit = stated.get(name, noise)[: len(noise)]
             limits[name] = np.where(np.isfinite(limit), limit, noise)
         change = excited(inner, size[at], limits[name], new)
+        if change is None:
+            unit[at] = limits[name]
+        else:
+            changes.append((at, change))
+    scaled = products * (unit[:, None] * unit)
+    for at, change in changes:
         scaled[:, :, at] = scaled[:, :, at] @ change
         scaled[:, at] = change.T @ scaled[:, at]
     return CandidateProblem(scaled, prior, within, free, versions, limits, excluded, least)
@@ -164,36 +175,6 @@ class Given:
         """Return log E of the sets under each hypothesis: (t, s) array."""
         return np.asarray(self.level + self.problem.rss(self.squares))
 
-    def conditionals(self, names: Sequence[str]) -> list[dict[str, Values]]:
-        """Return log E of each set with each of some effects, without prior odds: its (versions, scales) array."""
-        of_sets: list[dict[str, Values]] = [{} for _ in self.level.T]
-        for block in self.blocks(names):
-            evidence = np.logaddexp.reduce(block.score, axis=1).transpose(1, 2, 0)
-            for of_set, each in zip(of_sets, evidence, strict=True):
-                of_set.update(zip(block.names, np.split(each, block.starts[1:]), strict=True))
-        return of_sets
-
-    def mixtures(self, names: Sequence[str]) -> dict[str, tuple[Values, Values, Values]]:
-        """Return the distribution of each effect's parameters over their limits, given the first set: a mixture.
-
-        Log weight, (m,), mean and standard deviation, (m, k), of its normal components.
-        """
-        mixtures = {}
-        for block in self.blocks(names):
-            score, inner, cross, squares = block.score[:, :, 0], block.inner[:, 0], block.cross[:, 0], block.squares
-            top = np.maximum.reduceat(np.max(score, axis=(0, 1)), block.starts)
-            owner = np.repeat(np.arange(len(block.names)), np.diff([*block.starts, score.shape[2]]))
-            kept = score > top[owner] + np.log(NEGLIGIBLE_MIXTURE_WEIGHT)
-            s, t, m = np.nonzero(kept)
-            inverse = np.linalg.inv(inner[t, m] + LIMIT_SCALES[s, None, None] ** -2.0 * np.eye(inner.shape[-1]))
-            mean, weight = (inverse @ cross[t, m, :, None])[..., 0], score[kept]
-            variance = np.einsum("nkk->nk", inverse) * self.problem.variance(squares[:, :, 0][kept])[:, None]
-            deviation = np.sqrt(np.maximum(variance, 0.0))
-            for j, name in enumerate(block.names):
-                of_effect = owner[m] == j
-                mixtures[name] = weight[of_effect], mean[of_effect], deviation[of_effect]
-        return mixtures
-
     def blocks(self, names: Sequence[str]) -> list[CandidateBlock]:
         """Return further effects, grouped by their number of columns."""
         by_size: dict[int, list[str]] = {}
@@ -216,6 +197,14 @@ class Given:
         return blocks
 
 
+class Conditional(NamedTuple):
+    """Log E of a set with a further effect, without prior odds: over all its versions and scales, and at the best."""
+
+    total: float
+    best: float
+    pick: Pick
+
+
 @dataclass(frozen=True)
 class CandidateBlock:
     """Effects with equal numbers of columns, given s sets; their m versions follow each other."""
@@ -226,6 +215,58 @@ class CandidateBlock:
     cross: Values  # (t, s, m, k), with the readings
     score: Values  # (scales, t, s, m), log E
     squares: Values  # (scales, t, s, m), RSS
+
+    def under(self, kept: Values) -> CandidateBlock:
+        """Return the block under some of the hypotheses."""
+        score, squares = self.score[:, kept], self.squares[:, kept]
+        return replace(self, inner=self.inner[kept], cross=self.cross[kept], score=score, squares=squares)
+
+    @cached_property
+    def conditionals(self) -> list[dict[str, Conditional]]:
+        """Log E of each set with each effect."""
+        scales, count = len(self.score), self.score.shape[3]
+        evidence = log_sum(self.score, 1).transpose(1, 2, 0).reshape(self.score.shape[2], -1)
+        first = scales * self.starts
+        owner = np.repeat(np.arange(len(first)), np.diff([*first, scales * count]))
+        best = np.maximum.reduceat(evidence, first, axis=1)
+        above = evidence - best[:, owner]
+        total = best + np.log(np.add.reduceat(np.exp(above), first, axis=1))
+        places = np.where(above == 0.0, np.arange(scales * count), scales * count)
+        picks = np.minimum.reduceat(places, first, axis=1) - first
+        rows = zip(total.tolist(), best.tolist(), picks.tolist(), strict=True)
+        return [
+            {n: Conditional(t, b, divmod(p, scales)) for n, t, b, p in zip(self.names, *row, strict=True)}
+            for row in rows
+        ]
+
+    def mixtures(self, number: int, names: Collection[str], problem: CandidateProblem) -> dict[str, Mixture]:
+        """Return the distribution of the parameters of some of the effects over their limits, given one of the sets."""
+        mixtures = {}
+        score, inner, cross, squares = (
+            self.score[:, :, number],
+            self.inner[:, number],
+            self.cross[:, number],
+            self.squares[:, :, number],
+        )
+        top = np.maximum.reduceat(np.max(score, axis=(0, 1)), self.starts)
+        owner = np.repeat(np.arange(len(self.names)), np.diff([*self.starts, score.shape[2]]))
+        kept = score > top[owner] + np.log(NEGLIGIBLE_MIXTURE_WEIGHT)
+        s, t, m = np.nonzero(kept)
+        inverse = np.linalg.inv(inner[t, m] + LIMIT_SCALES[s, None, None] ** -2.0 * np.eye(inner.shape[-1]))
+        mean, weight = (inverse @ cross[t, m, :, None])[..., 0], score[kept]
+        variance = np.einsum("nkk->nk", inverse) * problem.variance(squares[kept])[:, None]
+        deviation = np.sqrt(np.maximum(variance, 0.0))
+        for j, name in enumerate(self.names):
+            if name in names:
+                of_effect = owner[m] == j
+                mixtures[name] = weight[of_effect], mean[of_effect], deviation[of_effect]
+        return mixtures
+
+
+def log_sum(values: Values, axis: int) -> Values:
+    """Return the logarithm of the sum of exponentials."""
+    top = values.max(axis=axis, keepdims=True)
+    return np.asarray(np.log(np.sum(np.exp(values - top), axis=axis)) + np.squeeze(top, axis))
 
 
 def _explained(inner: Values, cross: Values, squares: Values) -> tuple[Values, Values]:

@@ -292,19 +292,24 @@ class GaussMarkov:
         return np.asarray(whitened @ whitened.transpose(0, 2, 1))
 
     def whitened(self, columns: Values) -> Values:
-        """Return ``R A`` with ``R^T R = C^-1`` of (m, p) columns, blocks last and in order: (g, p, m) array."""
-        below = np.append(self._e, 0.0).reshape(self._half.shape)  # subdiagonal of L; T = L D L^T
+        """Return ``R A`` with ``R^T R = C^-1`` of (m, p) columns, blocks last and in order: (g, p, m) array.
+
+        In ``z_k = own_k a_k - past_k a_(k-1) - carried_k z_(k-1)`` each factor is of one setting and block.
+        """
+        root = np.sqrt(self._d.reshape(self._half.shape))
+        below = np.append(self._e, 0.0).reshape(root.shape)[:, :-1]  # subdiagonal of L; T = L D L^T
+        past = self._phi / (self._half[:, :-1] * root[:, 1:])
         # blocks first, then settings and columns: numpy is fast if the last axis is long and contiguous
-        axis = 2 if columns.shape[1] > len(below) else 1  # of the columns
-        factors = self._half, self._phi, below, np.sqrt(self._d.reshape(below.shape))
-        half, phi, below, root = (np.expand_dims(np.ascontiguousarray(v.T), axis) for v in factors)
-        z = np.expand_dims(columns[self._order], 3 - axis) / half
-        z[1:] -= phi * z[:-1]
+        axis = 2 if columns.shape[1] > len(root) else 1  # of the columns
+        factors = 1.0 / (self._half * root), past, below * root[:, :-1] / root[:, 1:]
+        own, past, carried = (np.expand_dims(np.ascontiguousarray(v.T), axis) for v in factors)
+        ordered = np.expand_dims(columns[self._order], 3 - axis)
+        z = own * ordered
+        z[1:] -= past * ordered[:-1]
         rows, part = [*z], np.empty(z.shape[1:])
-        for before, row, factor in zip(rows, rows[1:], below, strict=False):  # z = L^-1 w
+        for before, row, factor in zip(rows, rows[1:], carried, strict=False):
             np.subtract(row, np.multiply(factor, before, out=part), out=row)
-        z /= root
-        return np.ascontiguousarray(z.transpose(3 - axis, axis, 0))
+        return z.transpose(3 - axis, axis, 0)
 
     def solve(self, columns: Values) -> Values:
         """Return ``C^-1 A`` of (m, p) columns: (g, m, p) array."""

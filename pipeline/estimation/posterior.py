@@ -32,11 +32,15 @@ from pipeline.estimation.evidence import (
     LIMIT_SCALES,
     NEGLIGIBLE_MIXTURE_WEIGHT,
     SCALE_PRIOR,
+    CandidateBlock,
     CandidateProblem,
+    Conditional,
     EffectSet,
     Given,
+    Mixture,
     Pick,
     linear_problem,
+    log_sum,
 )
 from pipeline.estimation.gauss_markov import WHITE_SETTING, random_walks
 from pipeline.estimation.generalized_least_squares import JointFit, design_at, fit_terms
@@ -108,7 +112,9 @@ class SetSearch:
     ) -> None:
         self.problem, self.required = problem, frozenset(required)
         self.pool: dict[EffectSet, Found] = {}
-        self._known: dict[frozenset[tuple[str, Pick]], dict[str, Values]] = {}  # log E with each effect, given picks
+        self._known: dict[frozenset[tuple[str, Pick]], dict[str, Conditional]] = {}  # with each effect, given picks
+        # blocks of all effects, and the number of the set among theirs, given picks
+        self._blocks: dict[frozenset[tuple[str, Pick]], tuple[list[CandidateBlock], int]] = {}
         self._extended: set[EffectSet] = set()
         first = [*dict.fromkeys([self.required, *(frozenset(seed) | self.required for seed in seeds)])]
         self._prune(first)
@@ -123,20 +129,26 @@ class SetSearch:
         """Return the most probable set of all, or of some."""
         return max(among or self.pool, key=lambda names: self.pool[names].score)
 
-    def given(self, names: EffectSet, but: EffectSet = frozenset()) -> Given:
-        """Return the problem given a set without some of its members."""
-        return Given(self.problem, [{n: pick for n, pick in self.pool[names].picks.items() if n not in but}])
+    def mixtures(self, names: EffectSet, but: EffectSet, added: Sequence[str]) -> dict[str, Mixture]:
+        """Return the distribution of the parameters of further effects, given a set without some of its members."""
+        picks = {n: pick for n, pick in self.pool[names].picks.items() if n not in but}
+        blocks, number = self._blocks.get(frozenset(picks.items())) or (Given(self.problem, [picks]).blocks(added), 0)
+        return {n: m for block in blocks for n, m in block.mixtures(number, added, self.problem).items()}
 
     def _prune(self, seeds: Sequence[EffectSet]) -> None:
         """Remove the noise hypotheses that have no weight given any of the sets ``seeds``."""
         kept = np.zeros(len(self.problem.prior), bool)
         for names in seeds:
-            given = Given(self.problem, [dict.fromkeys(sorted(names), FIRST_VERSION_AND_SCALE)])
-            blocks = given.blocks(self._allowed(names))
+            picks = dict.fromkeys(sorted(names), FIRST_VERSION_AND_SCALE)
+            given, allowed = Given(self.problem, [picks]), self._allowed(names)
+            blocks = given.blocks(allowed)
+            if len(allowed) == len(self.problem.versions):
+                self._blocks[frozenset(picks.items())] = blocks, 0
             best = [np.maximum.reduceat(np.max(b.score[:, :, 0], axis=0), b.starts, axis=1) for b in blocks]
             scores = np.concatenate([given.alone(), *best], axis=1)
             kept |= np.any(scores > scores.max(axis=0) + np.log(NEGLIGIBLE_MIXTURE_WEIGHT), axis=1)
         self.problem = self.problem.under(kept)
+        self._blocks = {key: ([block.under(kept) for block in each], n) for key, (each, n) in self._blocks.items()}
 
     def _allowed(self, names: EffectSet) -> list[str]:
         barred = names.union(*(self.problem.excluded.get(n, frozenset()) for n in names))
@@ -180,16 +192,19 @@ class SetSearch:
         self._extended.update(new)
         for names in new:
             self._finish(names)
-        given = Given(self.problem, [self.pool[names].picks for names in new]) if new else None
-        conditionals = given.conditionals([*self.problem.versions]) if given else []
-        for names, evidence in zip(new, conditionals, strict=True):
-            parent = self.pool[names]
-            self._known[frozenset(parent.picks.items())] = evidence
+        keys = {names: frozenset(self.pool[names].picks.items()) for names in new}
+        unknown = [names for names in new if keys[names] not in self._blocks]
+        if unknown:
+            blocks = Given(self.problem, [self.pool[names].picks for names in unknown]).blocks([*self.problem.versions])
+            self._blocks |= {keys[names]: (blocks, number) for number, names in enumerate(unknown)}
+        for names in new:
+            parent, (blocks, number) = self.pool[names], self._blocks[keys[names]]
+            evidence = {n: each for block in blocks for n, each in block.conditionals[number].items()}
+            self._known[keys[names]] = evidence
             for name in self._allowed(names):
-                child, total = names | {name}, float(np.logaddexp.reduce(evidence[name], axis=None))
+                child, (total, best, pick) = names | {name}, evidence[name]
                 score, known = total + parent.spread + ODDS * len(child), self.pool.get(child)
                 if known is None or (not known.final and known.score < score):
-                    best, pick = _largest(evidence[name])
                     spread = total - best if len(child) == 1 else 0.0
                     self.pool[child] = Found(score, {**parent.picks, name: pick}, spread, final=len(child) == 1)
         return list(dict.fromkeys(names | {name} for names in level for name in self._allowed(names)))
@@ -207,21 +222,14 @@ class SetSearch:
                 others = {n: pick for n, pick in picks.items() if n != name}
                 known_of = self._known.setdefault(frozenset(others.items()), {})
                 if name not in known_of:
-                    known_of |= Given(self.problem, [others]).conditionals([name])[0]
-                evidence = known_of[name]
-                score, picks[name] = _largest(evidence)
-                spread += float(np.logaddexp.reduce(evidence, axis=None)) - score
+                    known_of |= Given(self.problem, [others]).blocks([name])[0].conditionals[0]
+                total, score, picks[name] = known_of[name]
+                spread += total - score
             if picks == before:
                 break
         if not picks:
-            score = float(np.logaddexp.reduce(Given(self.problem, [{}]).alone(), axis=None))
+            score = float(log_sum(Given(self.problem, [{}]).alone()[:, 0], 0))
         self.pool[names] = Found(score + spread + ODDS * len(names), picks, spread, final=True)
-
-
-def _largest(evidence: Values) -> tuple[float, Pick]:
-    """Return the largest of (versions, scales) values, with its version and scale."""
-    v, s = divmod(int(np.argmax(evidence)), evidence.shape[1])
-    return float(evidence[v, s]), (v, s)
 
 
 def answers(searches: Sequence[SetSearch | None], owner: Callable[[EffectSet], int], names: Iterable[str]) -> Answers:
@@ -264,7 +272,7 @@ def _upper_limits(names: Sequence[str], likely: Sequence[tuple[SetSearch, Effect
                 seen.add((id(search), rest, name))
                 by_rest.setdefault(rest, []).append(name)
         for rest, added in by_rest.items():
-            for name, (weight, mean, deviation) in search.given(members, members - rest).mixtures(added).items():
+            for name, (weight, mean, deviation) in search.mixtures(members, members - rest, added).items():
                 limit = search.problem.limits[name]
                 parts.setdefault(name, []).append((weight + ODDS * len(rest), mean * limit, deviation * limit))
     mixtures = {}

@@ -248,8 +248,8 @@ def test_a_scan_of_single_forms_finds_what_the_products_of_all_curves_say() -> N
     for texts in tried:
         columns = columns_of(texts, "gyroscope")
         values = scan.values(columns)
-        expected = ProjectedCurves(scan, columns).drop([0, 1])[:, :, -1:]
-        found = scan.drops(scan.of_axes(np.stack([values, 2.0 * values + 1.0], axis=-2)), 2)[:, :, :1]
+        expected = ProjectedCurves(scan, values).drop([0, 1])[:, :, -1:]
+        found = scan.drops(np.stack([values, 2.0 * values + 1.0], axis=-2))[:, :, :1]
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
         one, other = scan.best_axes(found, 2)[0], scan.best_axes(expected, 2)[0]
         assert (one.axes, one.setting) == (other.axes, other.setting)
@@ -272,7 +272,7 @@ def test_a_shape_gains_what_a_joint_fit_with_it_gains() -> None:
     fit = fit_terms(selection.observations, terms, selection.start, selection.settings)
     formulas = harmonic(5).texts
     scan = Scan(selection)
-    projected = ProjectedCurves(scan, columns_of(formulas, "gyroscope"))
+    projected = ProjectedCurves(scan, scan.values(columns_of(formulas, "gyroscope")))
     drop = projected.drop([0, 1])[:, :, -1:]
     expected = 2.0 * (fit.log_likelihood - selection.fit.log_likelihood) - 6.0 * np.log(scan.samples)
     assert scan.gains(drop, 6)[0] == pytest.approx(expected, abs=0.5)
@@ -285,8 +285,8 @@ def test_a_power_that_the_base_holds_already_says_nothing_new() -> None:
     selection = selection_of("accelerometer", record(Session(2, SHORT)))
     scan = Scan(selection)
     curves = columns_of(["fx", "fx ** 2", "2 * fx ** 2 + 3 * fy", "cos(radians(angle))"], "accelerometer")
-    assert ProjectedCurves(scan, curves).independent([0, 1, 2]) == [1]
-    drops = scan.drops(scan.of_axes(scan.values(curves)[..., None]))
+    assert ProjectedCurves(scan, scan.values(curves)).independent([0, 1, 2]) == [1]
+    drops = scan.drops(scan.values(curves)[..., None])
     assert drops[:, :, 0].max() == 0.0
     assert drops[:, :, 1].max() > 0.0
 
@@ -294,7 +294,8 @@ def test_a_power_that_the_base_holds_already_says_nothing_new() -> None:
 def test_a_curve_that_rounding_hides_explains_nothing() -> None:
     selection = replace(selection_of("gyroscope", record(Session(2, SHORT))), settings=[Setting(4.4, 800.0)])
     formulas = ["time", "exp(-time / 30000)", "time ** 2", "time + 1e-8 * time ** 2"]
-    projected = ProjectedCurves(Scan(selection), columns_of(formulas, "gyroscope"))
+    scan = Scan(selection)
+    projected = ProjectedCurves(scan, scan.values(columns_of(formulas, "gyroscope")))
     explained = projected.drop(range(4))
     assert np.all(explained[:, :, 1] > explained[:, :, 0])
     assert np.all(explained[:, :, 1:] == explained[:, :, 1:2])

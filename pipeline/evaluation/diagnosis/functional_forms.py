@@ -28,7 +28,8 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from itertools import combinations
+from functools import cached_property
+from itertools import combinations, product
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -37,7 +38,6 @@ import scipy
 from pipeline.estimation.design import CURVE_DEGREE, joined_motions, true_motion
 from pipeline.estimation.gauss_markov import WHITE_SETTING, GaussMarkov
 from pipeline.estimation.ranking import MIN_LEFT_SQUARE_SHARE, MIN_NEW_COLUMN_SHARE, UNIT_COLUMN_RIDGE
-from pipeline.evaluation.diagnosis.words import listed
 from pipeline.physics.effects.base import truth, unit_of
 from pipeline.physics.formula import parse
 
@@ -166,7 +166,19 @@ class Factor:
     words: str  # a noun phrase
     complexity: int = 2  # its signal and its function
     power: int = 0  # of the signal's unit; 0: without a unit
-    constants: tuple[float, ...] = ()  # scanned
+    constants: tuple[float, ...] = ()  # scanned, as the formula states them
+    origin: float = 0.0  # of the signal in an exponential
+
+    def values(self, signal: Values) -> Values | None:
+        """Return the values of a step or an exponential without parsing its formula; None for other factors."""
+        if self.kind == "step":
+            above = signal - self.constants[0]
+            sharp = len(self.constants) == 1
+            return np.heaviside(above, 1.0) if sharp else 0.5 * (1.0 + np.tanh(above / self.constants[1]))
+        if self.kind in ("exponential", "growth"):
+            sign = 1.0 if self.kind == "growth" else -1.0
+            return np.asarray(np.exp(sign * (signal - self.origin) / self.constants[0]))
+        return None
 
 
 @dataclass(frozen=True)
@@ -219,7 +231,7 @@ class Form:
         same = self.factor.kind == other.factor.kind and self.factor.signal == other.factor.signal
         return same and bool(self.factor.constants)
 
-    @property
+    @cached_property
     def name(self) -> tuple[str, ...]:
         """What all forms have in common that differ in their constants alone."""
         scanned = (self.factor.kind, self.factor.signal, str(self.scanned))
@@ -275,21 +287,23 @@ def harmonic(n: int) -> Factor:
 def step(span: Span, place: float, width: float | None = None) -> Factor:
     """Return a step at a place, sharp or over a width."""
     signal, unit, digits = span.signal, SIGNAL_UNITS[span.signal], 0 if span.signal == "time" else 1
-    words = f"a step at {place:.{digits}f} {unit}"
+    words, place = f"a step at {place:.{digits}f} {unit}", float(f"{place:.7g}")
     if width is None:
         return Factor("step", signal, (f"step({signal} - {place:.7g})",), words, constants=(place,))
+    width = float(f"{width:.3g}")
     soft = f"0.5 * (1 + tanh(({signal} - {place:.7g}) / {width:.3g}))"
-    over = f"{words}, over about {2 * float(f'{width:.3g}'):.2g} {unit}"
-    return Factor("step", signal, (soft,), over, 3, constants=(place, width))
+    return Factor("step", signal, (soft,), f"{words}, over about {2 * width:.2g} {unit}", 3, constants=(place, width))
 
 
 def exponential(span: Span, constant: float, *, growth: bool) -> Factor:
     """Return an exponential that decays from the smallest value, or grows towards the largest."""
     s, signal = float(f"{constant:.4g}"), span.signal
-    text = f"({signal} - {span.rounded(span.high):g})" if growth else f"({span.rounded(span.low):g} - {signal})"
+    origin = f"{span.rounded(span.high if growth else span.low):g}"
+    text = f"({signal} - {origin})" if growth else f"({origin} - {signal})"
     words = f"an exponential of the {signal} that {'grows' if growth else 'decays'} with a constant of {s:.3g} "
     kind = "growth" if growth else "exponential"
-    return Factor(kind, signal, (f"exp({text} / {s:g})",), words + SIGNAL_UNITS[signal], constants=(s,))
+    texts = (f"exp({text} / {s:g})",)
+    return Factor(kind, signal, texts, words + SIGNAL_UNITS[signal], constants=(s,), origin=float(origin))
 
 
 def bands(span: Span) -> list[Factor]:
@@ -332,38 +346,6 @@ def finer(factor: Factor, span: Span, spacing: float) -> Iterator[Factor]:
         yield from (exponential(span, c, growth=factor.kind == "growth") for c in constants)
 
 
-def sizes_of(form: Form, coefficients: Values, observations: Observations) -> Values:
-    """Return the amplitude, height or whole change of a form on each axis: (3,) array."""
-    if form.factor.kind == "harmonic":
-        return np.asarray(np.linalg.norm(coefficients, axis=1), np.float64)
-    if form.is_height:
-        return coefficients[:, 0]
-    columns = columns_of(form.formulas, observations.sensor)
-    values = np.concatenate([columns(part.motion) for part in observations.parts])
-    return np.asarray(np.ptp(np.sum(values * coefficients, axis=2), axis=0), np.float64)
-
-
-def described(form: Form, sizes: Values, axes: Sequence[int], sensor: str) -> str:
-    """Return a fitted form as a noun phrase: ``a step at 31.0 degC, of 3.9 mg on x and -2.1 mg on z``.
-
-    ``sizes``: those of ``sizes_of``. Heights have a sign.
-    """
-    unit, scale = unit_of(sensor), 1.0
-    if form.kind == "ripple":
-        unit, scale = "%", 100.0
-    elif sensor == "accelerometer" and float(np.abs(sizes).max()) < 0.1:
-        unit, scale = "mg", 1e3
-    values = scale * (sizes if form.is_height else np.abs(sizes))
-    size = listed([f"{values[c]:.3g} {unit} on {'xyz'[c]}" for c in axes])
-    phrase = form.factor.words
-    if form.modulator:
-        text = form.modulator.texts[0]
-        phrase += f" in proportion to {'the rate' if form.kind == 'ripple' else SIGNAL_WORDS.get(text, text)}"
-    if form.factor.kind == "harmonic":
-        return f"{phrase}, amplitude {size}"
-    return f"{phrase}, of {size}" if form.is_height else f"{phrase}, {size} in all"
-
-
 @dataclass(frozen=True)
 class FormGain:
     """The improvement of the fit by a functional form."""
@@ -384,33 +366,44 @@ class Whitened(NamedTuple):
         """Return the products with other columns: (t, q, p) array."""
         return np.asarray(self.means @ other.means.transpose(0, 2, 1) + self.inside.T @ other.inside)
 
+    def grams(self, r: int) -> Values:
+        """Return the products of the columns of each of m forms of r columns: (t, m, r, r) array."""
+        forms = len(self.means[0]) // r
+        if forms == 1:
+            return self.times(self)[:, None]
+        found = np.empty((len(self.means), forms, r, r))
+        for i, j in product(range(r), repeat=2):
+            found[..., i, j] = np.einsum("tqm,tqm->tq", self.means[:, i::r], self.means[:, j::r])
+            found[..., i, j] += np.einsum("nq,nq->q", self.inside[:, i::r], self.inside[:, j::r])
+        return found
+
 
 class Scan:
     """The residual of a selection's fit under every noise setting, and its reduction by further columns.
 
-    ``explained``: curves that are projected out too.
+    ``explained``: curves that are projected out too. ``rows``: the observations of the selection with other weights.
     """
 
-    def __init__(self, selection: Selection, explained: Curves | None = None) -> None:
+    def __init__(self, selection: Selection, explained: Curves | None = None, rows: Observations | None = None) -> None:
         self.scale = selection.start.scale
-        observations = selection.observations.less_stop_errors
+        observations = (rows or selection.observations).less_stop_errors
         self.samples = 3.0 * observations.samples
         self.within = float(np.sum(observations.scatter / self.scale**2))
         self._motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]
         self._joined = [motion for motion, _ in joined_motions(self._motions)]
-        self._blocks, self._weight = observations.blocks, observations.weight
-        self._label = self._blocks.label(len(self._weight))
-        self._noise = GaussMarkov(self._blocks, [WHITE_SETTING, *selection.settings])
+        self.blocks, self.weight = observations.blocks, observations.weight
+        self._label = self.blocks.label(len(self.weight))
+        self.noise = GaussMarkov(self.blocks, [WHITE_SETTING, *selection.settings])
         self._unit = float(UNIT_ROUNDOFF * np.sqrt(observations.samples)) ** 0.5
-        design = selection.fit.design(observations)
+        design = selection.fit.design(selection.observations.less_stop_errors)  # its columns depend on no weight
         A, places = design.columns.columns, [design.places(c)[0] for c in range(3)]
         if explained is not None:
             values, first = self.values(explained), A.shape[1]
             n, versions, q = values.shape
             A = np.concatenate([A, values.reshape(n, -1)], axis=1)
             places = [np.append(first + c % versions * q + np.arange(q), place) for c, place in enumerate(places)]
-        self._every = self.whitened(A)  # model, explained curves and readings of all axes
-        self._among = self._every.times(self._every)
+        self.columns, self.every = A, self.whitened(A)  # model, explained curves and readings of all axes
+        self._among = self.every.times(self.every)
         self._fitted: list[tuple[Index, int, Values]] = []  # of each axis: model, residual, inverse of its products
         left = []
         for c, (*known, target) in enumerate(places):
@@ -423,7 +416,7 @@ class Scan:
             cross = self._among[:, known, target]
             taken = np.einsum("tp,tpq,tq->t", cross, inverse, cross)
             left.append((self._among[:, target, target] - taken)[1:] / self.scale[c] ** 2)
-        logarithms = self._noise.log_determinant[1:] + np.sum(np.log(self._blocks.weight))
+        logarithms = self.noise.log_determinant[1:] + np.sum(np.log(self.blocks.weight))
         self._penalty: Values = 1.5 * logarithms - np.array([setting.prior for setting in selection.settings])
         self.left: Values = np.stack(left, axis=1)
         self.before = float(self.log_likelihood(self.left.sum(axis=1)).max())
@@ -437,21 +430,25 @@ class Scan:
 
     def whitened(self, columns: Values) -> Whitened:
         """Return (n, q) columns whitened."""
-        means = self._blocks.sums(self._weight[:, None] * columns) / self._blocks.weight[:, None]
+        means = self.means(columns)
         inside = columns - means[self._label]
-        inside *= np.sqrt(self._weight)[:, None]
-        return Whitened(inside, self._noise.whitened(means))
+        inside *= np.sqrt(self.weight)[:, None]
+        return Whitened(inside, self.noise.whitened(means))
+
+    def means(self, columns: Values) -> Values:
+        """Return the means of (n, q) columns in blocks: (m, q) array."""
+        return np.asarray(self.blocks.sums(self.weight[:, None] * columns) / self.blocks.weight[:, None])
 
     def without_model(self, c: int, one: Whitened, other: Whitened) -> Values:
         """Return the products of columns on an axis without their part in the model, white noise first: (t, q, p)."""
         known, _, inverse = self._fitted[c]
-        taken = one.times(self._every)[:, :, known] @ inverse @ self._every.times(other)[:, known]
+        taken = one.times(self.every)[:, :, known] @ inverse @ self.every.times(other)[:, known]
         return np.asarray((one.times(other) - taken) / self.scale[c] ** 2)
 
     def squares_without_model(self, c: int, one: Whitened) -> Values:
         """Return the squares of columns on an axis without their part in the model, white noise first: (t, q)."""
         known, _, inverse = self._fitted[c]
-        cross = one.times(self._every)[:, :, known]
+        cross = one.times(self.every)[:, :, known]
         own = np.einsum("tqm,tqm->tq", one.means, one.means) + np.einsum("nq,nq->q", one.inside, one.inside)
         return np.asarray((own - np.einsum("tqp,tqp->tq", cross @ inverse, cross)) / self.scale[c] ** 2)
 
@@ -489,39 +486,44 @@ class Scan:
             for m, a in enumerate(best.tolist())
         ]
 
-    def of_axes(self, columns: Values) -> list[Whitened]:
-        """Return (n, 3, m, r) columns of m forms with r coefficients whitened, or (n, 1, m, r) equal on all axes."""
-        return [self.whitened(columns[:, c].reshape(len(columns), -1)) for c in range(columns.shape[1])]
+    def drops(self, columns: Values) -> Values:
+        """Return the drops of m forms of r columns under each noise on each axis: (t, 3, m).
 
-    def drops(self, versions: Sequence[Whitened], r: int = 1) -> Values:
-        """Return the drops of m forms of r columns under each noise on each axis: (t, 3, m); see ``products``."""
-        inner, cross, error = self.products(versions, r)
+        ``columns``: (n, 3, m, r), or (n, 1, m, r) if they are equal on all axes.
+        """
+        versions = [self.whitened(each.reshape(len(each), -1)) for each in np.moveaxis(columns, 1, 0)]
+        grams = [version.grams(columns.shape[3]) for version in versions]
+        return self.drops_of(grams, [version.times(self.every) for version in versions])
+
+    def drops_of(self, grams: Sequence[Values], across: Sequence[Values]) -> Values:
+        """Return ``drops`` from products of columns; see ``_without_model``."""
+        inner, cross, error = self._without_model(grams, across)
         explained, new = each_explains(inner, cross[..., None], error)
         new &= new[0]
         return np.asarray(np.where(new.all(axis=3), explained[..., 0].sum(axis=3), 0.0)[1:])
 
     def products(self, versions: Sequence[Whitened], r: int) -> tuple[Values, Values, Values]:
-        """Return the products of m forms of r columns without their part in the model, white noise first.
+        """Return ``_without_model`` of m forms of r columns; ``versions``: the columns of each axis, or one for all."""
+        return self._without_model([each.grams(r) for each in versions], [v.times(self.every) for v in versions])
 
-        (t, 3, m, r, r) products of a form's columns, (t, 3, m, r) with the residual, and (t, 3, m, r) the error e of
-        each column. e exceeds the remaining norm of a column that is less than ``MIN_NEW_COLUMN_SHARE``
-        under white noise, or rounding alone under another noise. ``versions``: the columns of each axis, or one for
-        all.
+    def _without_model(self, grams: Sequence[Values], across: Sequence[Values]) -> tuple[Values, Values, Values]:
+        """Return products of m forms of r columns without their part in the model, white noise first.
+
+        ``grams``: (t, m, r, r), products of the columns of each form, for each axis, or once for all. ``across``: (t,
+        m r, k), those with model and readings. Returns (t, 3, m, r, r) products of a form's columns, (t, 3, m, r) with
+        the residual, and (t, 3, m, r) the error e of each column. e exceeds the remaining norm of a column that is less
+        than ``MIN_NEW_COLUMN_SHARE`` under white noise, or rounding alone under another noise.
         """
 
         def split(values: Values) -> Values:
-            return values.reshape(*values.shape[:-2], -1, r, values.shape[-1])
+            return values.reshape(*values.shape[:-2], *grams[0].shape[1:3], values.shape[-1])
 
-        grams, acrosses = [], [version.times(self._every) for version in versions]
-        for version in versions:
-            means, inside = split(version.means), split(version.inside.T)
-            grams.append(means @ means.swapaxes(-1, -2) + inside @ inside.swapaxes(-1, -2))
         sizes, found = np.sqrt(np.einsum("pp->p", self._among[0])), []
         for c, (known, target, inverse) in enumerate(self._fitted):
-            gram, across = grams[c % len(versions)], acrosses[c % len(versions)]
-            taken, own = across[:, :, known] @ inverse, np.einsum("tmrr->tmr", gram)
-            inner = gram - split(taken) @ split(across[:, :, known]).swapaxes(-1, -2)
-            cross = across[:, :, target] - (taken @ self._among[:, known, target, None])[:, :, 0]
+            gram, with_all = grams[c % len(grams)], across[c % len(grams)]
+            taken, own = with_all[:, :, known] @ inverse, np.einsum("tmrr->tmr", gram)
+            inner = gram - split(taken) @ split(with_all[:, :, known]).swapaxes(-1, -2)
+            cross = with_all[:, :, target] - (taken @ self._among[:, known, target, None])[:, :, 0]
             hidden = self._unit * (np.sqrt(own[0]) + (np.abs(taken) @ sizes[known]).reshape(own.shape))
             error = np.maximum(hidden, np.sqrt(MIN_LEFT_SQUARE_SHARE * own))
             error[0] = np.maximum(error[0], MIN_NEW_COLUMN_SHARE * np.sqrt(own[0]))
@@ -534,11 +536,10 @@ class Scan:
 class ProjectedCurves:
     """Products of q curves and the residual of a scan, after model and explained curves are projected out of them.
 
-    The products are without white noise alone.
+    ``values``: as of ``Scan.values``. The products are without white noise alone.
     """
 
-    def __init__(self, scan: Scan, curves: Curves) -> None:
-        values = scan.values(curves)
+    def __init__(self, scan: Scan, values: Values) -> None:
         self.columns = [scan.whitened(values[:, k]) for k in range(values.shape[1])]
         inner, cross, error = (each[:, :, 0] for each in scan.products(self.columns, values.shape[2]))
         self.inner, self.cross, self.error = inner[1:], cross[1:], error[1:]

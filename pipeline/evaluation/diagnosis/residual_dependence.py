@@ -145,7 +145,7 @@ def _significant(selection: Selection, explained: Curves | None) -> dict[str, tu
 
 
 def _tests_of_curves(bases: Sequence[Basis], scan: Scan) -> Tests:
-    projected = ProjectedCurves(scan, _curves_of(bases))
+    projected = ProjectedCurves(scan, scan.values(_curves_of(bases)))
     names: list[str] = []
     counts: list[int] = []
     drops = [np.zeros((*scan.left.shape, 0))]
@@ -185,9 +185,9 @@ def _tests_of_steps(selection: Selection, covariates: Sequence[str], scan: Scan)
 
     values = scan.values(curves)
     pairs = values[:, :, steps:].reshape(len(values), 1, 2, ripples).swapaxes(2, 3)  # cosine and sine of each
-    of_pairs = scan.drops(scan.of_axes(pairs), pairs.shape[3])
+    of_pairs = scan.drops(pairs)
     of_pairs = of_pairs[:, :, np.any(of_pairs, axis=(0, 1))]
-    drops = np.concatenate([scan.drops(scan.of_axes(values[:, :, :steps, None])), of_pairs], axis=2)
+    drops = np.concatenate([scan.drops(values[:, :, :steps, None]), of_pairs], axis=2)
     parameters = np.repeat([4, 6], [steps, of_pairs.shape[2]])
     return names + ["angle"] * of_pairs.shape[2], scan.gains(drops, parameters), parameters
 
@@ -195,7 +195,7 @@ def _tests_of_steps(selection: Selection, covariates: Sequence[str], scan: Scan)
 def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     """Return ``share_worse``, the share of simulations that fit worse, and ``simulations``, their number."""
     bases, observations, scan = _bases_of(selection), selection.observations.less_stop_errors, Scan(selection)
-    fitted = ProjectedCurves(scan, _curves_of(bases))
+    fitted = ProjectedCurves(scan, scan.values(_curves_of(bases)))
     within = np.append(scan.within, np.full(SIMULATIONS, 3.0 * (observations.samples - len(observations.weight))))
     left, cross = np.zeros((len(scan.left), 1 + SIMULATIONS)), []  # of the readings and each simulation
     for c, drawn in enumerate(_draws(selection)):
