@@ -349,15 +349,23 @@ def _published(results: Path, unit: str) -> ExportedUnit | None:
 
 
 def changed_files(unit: str, before: ExportedUnit | None, after: ExportedUnit | None) -> list[str]:
-    """Return a line on each change of the error of files of other programs that hold less than the calibration."""
+    """Return lines on files of other programs that hold less than the calibration, where their error or its changed."""
     if before is None or after is None:
         return []
     was, files = before.held_out_errors(less=False), dict[str, list[str]]()
+    best = [
+        {s: min(e for (x, _), e in errors.items() if x == s) for s, _ in errors}
+        for errors in (was, after.held_out_errors(less=False))
+    ]
     for (sensor, file), now in after.held_out_errors(less=True).items():
         error = was.get((sensor, file))
-        if error and abs(now / error - 1.0) > SMALLEST_CHANGE_OF_A_FILE:
-            change = f"{unit}, {sensor}, held-out error of files that hold less {error:.3g} -> {now:.3g}"
-            files.setdefault(f"{change} {SENSOR_UNITS[sensor]}", []).append(file)
+        if not error:
+            continue
+        change = f"{unit}, {sensor}, held-out error of files that hold less"
+        if abs(now / error - 1.0) > SMALLEST_CHANGE_OF_A_FILE:
+            files.setdefault(f"{change} {error:.3g} -> {now:.3g} {SENSOR_UNITS[sensor]}", []).append(file)
+        elif best[1][sensor] < (1.0 - SMALLEST_CHANGE_OF_A_FILE) * best[0][sensor]:
+            files.setdefault(f"{unit}, {sensor}, held-out error as before in files that hold less", []).append(file)
     return [f"{change}: {', '.join(names)}" for change, names in files.items()]
 
 
