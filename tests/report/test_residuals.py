@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from unit_settings import settings_of
 
-from pipeline.output.pages.residual_section import _binned_mean, harmonics, residuals
+from pipeline.output.pages.residual_section import _binned_mean, _of_errors, harmonics, residuals
 from pipeline.physics.signal.filters import apply_filter
 
 from .conftest import EFFECT, SIGMA, Unit, build_unit
@@ -43,9 +43,10 @@ def test_binned_means_find_the_covariate_that_matters() -> None:
     rng = np.random.default_rng(11)
     x = rng.uniform(0, 1, 9000)
     white = rng.standard_normal((9000, 3))
-    nothing, slope = _binned_mean(x, white), _binned_mean(x, white + 0.5 * x[:, None])
+    nothing = _binned_mean(x, *_of_errors(white))
+    slope = _binned_mean(x, *_of_errors(white + 0.5 * x[:, None]))
     assert nothing is not None
     assert slope is not None
     assert nothing.excess(np.zeros(3)) < 2.0
     assert slope.excess(np.zeros(3)) > 10.0
-    assert _binned_mean(np.full(9000, 3.0), white) is None
+    assert _binned_mean(np.full(9000, 3.0), *_of_errors(white)) is None

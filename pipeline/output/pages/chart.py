@@ -19,7 +19,9 @@ import math
 import re
 from base64 import b64encode
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from html import escape
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,6 +51,7 @@ LARGE_DOTS, LARGE_MEANS = 300, 40  # dots, and dots with intervals, that have ro
 LETTER = 6.2  # px, width of a letter
 
 
+@lru_cache(64)  # the panels of a chart often have one axis
 def round_ticks(low: float, high: float, count: int = 5, kind: str = "") -> list[Tick]:
     """Return about ``count`` round values from ``low`` to ``high`` with their text.
 
@@ -96,12 +99,12 @@ def scaled(values: Any, kind: str) -> Values:  # noqa: ANN401  (numbers or an ar
     ``log``: log10, -inf where v <= 0. ``symlog``: v / 10 where |v| <= 10, else sign(v) (1 + log10(|v| / 10)).
     """
     v = np.asarray(values, np.float64)
+    if "log" not in kind:
+        return v
     if kind == "log":
         return np.log10(v, out=np.full(v.shape, -np.inf), where=v > 0)
-    if kind == "symlog":
-        size = np.abs(v) / LINEAR_TO
-        return np.where(size <= 1.0, v / LINEAR_TO, np.copysign(1.0 + np.log10(np.maximum(size, 1.0)), v))
-    return v
+    size = np.abs(v) / LINEAR_TO
+    return np.where(size <= 1.0, v / LINEAR_TO, np.copysign(1.0 + np.log10(np.maximum(size, 1.0)), v))
 
 
 @dataclass(frozen=True)
@@ -134,8 +137,10 @@ class Axis:
     def units(self, values: Values) -> Integers:
         """Return the positions of values in whole drawing units; values beyond the axis are drawn at its end."""
         v = np.minimum(np.maximum(scaled(values, self.kind), self.low), self.high)
-        slope = SUBDIVISION * (self.stop - self.start) / (self.high - self.low)
-        return np.asarray(np.rint((v - self.low) * slope + SUBDIVISION * self.start).astype(np.int64))
+        v -= self.low
+        v *= SUBDIVISION * (self.stop - self.start) / (self.high - self.low)
+        v += SUBDIVISION * self.start
+        return np.asarray(np.rint(v, out=v).astype(np.int64))
 
     def ticks(self, count: int, names: Sequence[str] = ()) -> list[Tick]:
         """Return at least two ticks as position (px) and text; ``names``: texts of the values 1, 2, ..."""
@@ -157,7 +162,7 @@ class Axis:
         """Return the attributes that describe the axis to the script of the page."""
         ticks = f' data-ticks="{escape("|".join(names))}"' if names else ""
         ends = f"{self.low:.9g},{self.high:.9g},{self.start:g},{self.stop:g}"
-        return f' data-scale="{ends},{self.kind},{escape(typeset(label))}"{ticks}'
+        return f' data-scale="{ends},{self.kind},{_escaped(label)}"{ticks}'
 
 
 @dataclass(frozen=True)
@@ -296,13 +301,18 @@ def chart(
     long = [
         layer for p in panels for layer in p.layers if isinstance(layer, SampleMarks) and len(layer.x) > MAXIMUM_DOTS
     ]
-    attributes += _full(long[0].x, long[0].x, x) if long else ""
+    attributes += _full(long[0].x, long[0].x[:, None], x)[0] if long else ""
     return figure.drawn(description, top - PANEL_GAP + BOTTOM, "".join(parts), attributes)
 
 
 def text(x: float, y: float, content: str, kind: str = "") -> str:
     """Return a text element; ``kind`` is its CSS class (``e`` right-aligned, ``m`` centred, ``b`` bold)."""
-    return f'<text x="{x:.4g}" y="{y:.4g}" class="{kind}">{escape(typeset(content))}</text>'
+    return f'<text x="{x:.4g}" y="{y:.4g}" class="{kind}">{_escaped(content)}</text>'
+
+
+@lru_cache(4096)  # as ``typeset``
+def _escaped(content: str) -> str:
+    return escape(typeset(content))
 
 
 def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
@@ -329,52 +339,60 @@ def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
     return (
         f'<g class="panel"{y.attribute(panel.label, panel.rows)}><path class="grid" d="{grid}"/>'
         f'<g class="ticks">{labels}</g>'
-        f'<text class="m" transform="translate(12 {middle:g}) rotate(-90)">{escape(typeset(panel.label))}</text>'
+        f'<text class="m" transform="translate(12 {middle:g}) rotate(-90)">{_escaped(panel.label)}</text>'
         f'<g class="layers" transform="scale({1 / SUBDIVISION:g})">{drawn}</g>{names}</g>'
     )
 
 
 def _draw(layer: ChartLayer, x: Axis, y: Axis) -> str:
+    if isinstance(layer, Area) and layer.x is None:
+        low, high = y.units(np.array([layer.low, layer.high], float)).tolist()
+        start, stop = int(SUBDIVISION * x.start), int(SUBDIVISION * x.stop)
+        path = f"M{start} {low}l{stop - start} 0 0 {high - low} {start - stop} 0z"
+        return f'<path class="band c{layer.colour}" d="{path}"/>'
     if isinstance(layer, Area):
-        whole = (SUBDIVISION * np.array([x.start, x.stop])).astype(np.int64)
-        at = whole if layer.x is None else x.units(layer.x)
-        low, high = (np.broadcast_to(end, len(at)) for end in (layer.low, layer.high))
-        path = _line(np.concatenate([at, at[::-1]]), y.units(np.concatenate([low, high[::-1]])))
+        at = x.units(np.asarray(layer.x))
+        low, high = y.units(np.array([np.broadcast_to(end, len(at)) for end in (layer.low, layer.high)]))
+        path = _line(np.concatenate([at, at[::-1]]), np.concatenate([low, high[::-1]]))
         return f'<path class="band c{layer.colour}" d="{path}z"/>'
     if isinstance(layer, SampleMarks):
-        columns = enumerate(np.atleast_2d(layer.y.T), layer.colour)
-        return "".join(_samples(layer, column, f"c{colour}", x, y) for colour, column in columns)
+        return _samples(layer, layer.y if layer.y.ndim > 1 else layer.y[:, None], x, y)
     known = np.flatnonzero(np.isfinite(layer.x) & np.isfinite(layer.y))
     if isinstance(layer, LineMark):
-        breaks = np.flatnonzero(np.diff(known) > 1) + 1
-        ends = np.array([x.units(layer.x[known]), y.units(layer.y[known])])
-        path = "".join(_line(*piece) for piece in (np.split(ends, breaks, axis=1) if breaks.size else [ends]))
+        path = _line(x.units(layer.x[known]), y.units(layer.y[known]), np.flatnonzero(np.diff(known) > 1) + 1)
         return f'<path class="line c{layer.colour} {layer.style}" d="{path}"/>'
     at, path, room = x.units(layer.x[known]), "", LARGE_DOTS
-    if layer.low is not None and layer.high is not None:
-        low, high, room = y.units(layer.low[known]), y.units(layer.high[known]), LARGE_MEANS
-        path = f'<path class="strokes interval c{layer.colour}" d="{_path("M%d %dV%d", at, low, high)}"/>'
+    value, *ends = y.units(np.array([v[known] for v in (layer.y, layer.low, layer.high) if v is not None]))
+    if len(ends) == 2:
+        path = f'<path class="strokes interval c{layer.colour}" d="{_path("M%d %dV%d", at, *ends)}"/>'
+        room = LARGE_MEANS
     size = " large" * (len(layer.x) <= room)
     units = f' data-units="{" ".join(str(layer.units[i]) for i in known)}"' if layer.units else ""
-    return f'{path}<path class="dots{size} c{layer.colour}" d="{_dots(at, y.units(layer.y[known]))}"{units}/>'
+    return f'{path}<path class="dots{size} c{layer.colour}" d="{_dots(at, value)}"{units}/>'
 
 
-def _samples(layer: SampleMarks, values: Values, colour: str, x: Axis, y: Axis) -> str:
-    """Return one column of samples as dots, or as the ranges of buckets."""
-    known = np.isfinite(layer.x) & np.isfinite(values)
-    known_x, known_y = layer.x[known], values[known]
+def _samples(layer: SampleMarks, values: Values, x: Axis, y: Axis) -> str:
+    """Return columns of samples, (n, k), as dots, or as the ranges of buckets."""
+    known = np.isfinite(values) & np.isfinite(layer.x)[:, None]
+    if (known != known[:, :1]).any():  # each column has samples of its own
+        each = enumerate(values.T, layer.colour)
+        return "".join(_samples(replace(layer, colour=c), v[:, None], x, y) for c, v in each)
+    known_x, known_y = layer.x[known[:, 0]], values[known[:, 0]]
+    colours = range(layer.colour, layer.colour + values.shape[1])
     if len(known_x) <= MAXIMUM_DOTS:
-        return f'<path class="dots {colour}" d="{_dots(x.units(known_x), y.units(known_y))}"/>'
+        at, dots = x.units(known_x), y.units(known_y.T)
+        return "".join(f'<path class="dots c{c}" d="{_dots(at, v)}"/>' for c, v in zip(colours, dots, strict=True))
     start, count = _buckets(len(known_x), BUCKETS)
-    centre = x.units(np.add.reduceat(known_x, start) / count)
-    low, high = (y.units(end.reduceat(known_y, start)) for end in (np.minimum, np.maximum))
-    faint = " faint-strokes" * layer.mean
-    full = _full(layer.x, values, y)
-    out = f'<path class="strokes {colour}{faint}" d="{_path("M%d %dV%d", centre, low, high)}"{full}/>'
-    if layer.mean:
-        means = y.units(np.add.reduceat(known_y, start) / count)
-        out += f'<path class="line mean {colour}" d="{_line(centre, means)}"/>'
-    return out
+    at = x.units(np.add.reduceat(known_x, start) / count)
+    ends = [end.reduceat(known_y, start) for end in (np.minimum, np.maximum)]
+    means = [np.add.reduceat(known_y, start) / count[:, None]] if layer.mean else []
+    columns, full_of = y.units(np.array([*ends, *means])).transpose(2, 0, 1), _full(layer.x, values, y)
+    faint, out = " faint-strokes" * layer.mean, []
+    for c, column, full in zip(colours, columns, full_of, strict=True):
+        low, high, *mean = list(column)
+        out.append(f'<path class="strokes c{c}{faint}" d="{_path("M%d %dV%d", at, low, high)}"{full}/>')
+        out += [f'<path class="line mean c{c}" d="{_line(at, v)}"/>' for v in mean]
+    return "".join(out)
 
 
 def _buckets(samples: int, most: int) -> tuple[Integers, Integers]:
@@ -384,19 +402,23 @@ def _buckets(samples: int, most: int) -> tuple[Integers, Integers]:
     return start, np.diff(np.append(start, samples))
 
 
-def _full(x: Values, values: Values, axis: Axis) -> str:
-    """Return all values of a curve as the attribute ``data-full``; of too many values, both ends of each bucket."""
+def _full(x: Values, values: Values, axis: Axis) -> list[str]:
+    """Return all values of curves, (n, k), as attributes ``data-full``; of too many, both ends of each bucket."""
     if len(values) > MAXIMUM_FULL:
         start, _ = _buckets(len(values), MAXIMUM_FULL // 2)
-        ends = (x[start], x[start]) if values is x else (end.reduceat(values, start) for end in (np.fmin, np.fmax))
-        values = np.stack([*ends], 1).ravel()
-    share = (np.clip(values, axis.low, axis.high) - axis.low) / (axis.high - axis.low)
+        of_x = np.may_share_memory(values, x)
+        ends = [x[start, None]] * 2 if of_x else [end.reduceat(values, start) for end in (np.fmin, np.fmax)]
+        values = np.stack(ends, 1).reshape(-1, values.shape[1])
+    share = (np.minimum(np.maximum(values, axis.low), axis.high) - axis.low) / (axis.high - axis.low)
     numbers = np.where(np.isfinite(share), np.rint((2.0 * share - 1.0) * 32767.0), -32768.0).astype("<i2")
-    return f' data-full="{b64encode(numbers.tobytes()).decode()}"'
+    return [f' data-full="{b64encode(column.tobytes()).decode()}"' for column in numbers.T]
 
 
-def _line(x: Integers, y: Integers) -> str:
-    """Return the path through points, written as differences."""
+def _line(x: Integers, y: Integers, breaks: Integers | None = None) -> str:
+    """Return the path through points, written as differences; it begins again at ``breaks``."""
+    if breaks is not None and breaks.size:
+        ends = [0, *breaks.tolist(), len(x)]
+        return "".join(_line(x[i:j], y[i:j]) for i, j in pairwise(ends))
     if len(x) < 2:
         return _dots(x, y)
     if len(x) == 2:  # faster: a chart of rests has many of these

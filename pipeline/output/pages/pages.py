@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import deque
 from functools import cache, lru_cache
 from html import escape
 from pathlib import Path
@@ -46,6 +47,7 @@ TYPOGRAPHIC = {
     "gauss markov": "Gauss-Markov",
 }
 TEMPLATES = Path(__file__).parent / "templates"
+_sections: deque[tuple[JSON, Markup]] = deque(maxlen=2)  # budgets of both sensors of the last unit, and their sections
 PUBLISHED_DATA = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # in a campaign's page
 
 
@@ -162,6 +164,29 @@ def aligned(rows: Sequence[Sequence[str]], width: int | None = None) -> list[str
     return lines
 
 
+def budget_section(budget: JSON) -> Markup:
+    """Return the section of an uncertainty budget, made once for the page and the certificate of a unit."""
+    for known, made in _sections:
+        if known is budget:
+            return made
+    section: Markup = template("budget.html").module.budget(budget)  # type: ignore[attr-defined]  # a macro
+    _sections.append((budget, section))
+    return section
+
+
+def headings(columns: Sequence[str]) -> Markup:
+    """Return the cells of a table's head; "#" before a name aligns its column as numbers."""
+    return Markup("").join(map(_heading, columns))
+
+
+@lru_cache(512, typed=True)  # as ``typeset``; a text and markup differ
+def _heading(name: str) -> Markup:
+    if not name:
+        return Markup("<td></td>")
+    of_numbers = Markup(' class="n"') if name.startswith("#") else ""
+    return Markup('<th scope="col"{}>{}</th>').format(of_numbers, name.removeprefix("#"))
+
+
 def _figure(value: object, scale: Scale | None = None) -> str:
     """Return a number for a cell of a column with an SI prefix, empty for another value."""
     return number(value / (scale.factor if scale else 1.0)) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
@@ -190,8 +215,13 @@ def _environment() -> Environment:
     environment.filters |= {one.__name__: one for one in of_numbers}
     environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text}
     environment.filters |= {"parameter_texts": parameter_texts, "details": stage_details, "monte_carlo": monte_carlo_of}
-    environment.filters |= {"script_data": script_data, "numeric": "#{}".format}
-    environment.globals |= {"asset": asset, "unit_link": unit_link, "Verdict": Verdict}
+    environment.filters |= {"script_data": script_data, "numeric": "#{}".format, "headings": headings}
+    environment.globals |= {
+        "asset": asset,
+        "unit_link": unit_link,
+        "Verdict": Verdict,
+        "budget_section": budget_section,
+    }
     return environment
 
 

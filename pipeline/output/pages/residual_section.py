@@ -34,6 +34,7 @@ from pipeline.core.records import (
     MEDIAN_SIZE,
     SENSOR_UNITS,
     Integers,
+    Mask,
     Motion,
     Recording,
     SensorCalibration,
@@ -166,11 +167,19 @@ class _BinnedMean:
         return float(ratio.mean(axis=0).max())
 
 
-def _binned_mean(covariate: Values, error: Values) -> _BinnedMean | None:
-    """Return the means of ``error`` (n, 3) in 36 equal bins of the covariate (n,); None where it does not vary."""
-    known = np.isfinite(covariate) & np.isfinite(error).all(axis=1)
+def _of_errors(error: Values) -> tuple[Values, Mask, Values]:
+    """Return what ``_binned_mean`` needs of residuals (n, 3), for any covariate."""
+    return error, np.asarray(np.isfinite(error).all(axis=1)), np.asarray(np.mean(error**2, axis=0))
+
+
+def _binned_mean(covariate: Values, error: Values, finite: Mask, mean_square: Values) -> _BinnedMean | None:
+    """Return the means of ``error`` (n, 3) in 36 equal bins of the covariate (n,); None where it does not vary.
+
+    ``finite``: (n,), samples with an error on all axes; ``mean_square``: (3,), of the errors.
+    """
+    known = np.isfinite(covariate) & finite
     if not known.all():
-        covariate, error = covariate[known], error[known]
+        covariate, (error, _, mean_square) = covariate[known], _of_errors(error[known])
     low, high = (float(covariate.min()), float(covariate.max())) if len(covariate) else (0.0, 0.0)
     if not high - low > 1e-9 * max(1.0, abs(low)):
         return None
@@ -182,7 +191,7 @@ def _binned_mean(covariate: Values, error: Values) -> _BinnedMean | None:
         return None
     mean = np.stack([np.bincount(cell, e, RESIDUAL_BINS) / count for e in error.T], 1)
     between = np.sum(mean[filled] ** 2 * count[filled, None], axis=0) / count[filled].sum()
-    scatter = np.sqrt(np.maximum(np.mean(error**2, axis=0) - between, 0.0)) + 1e-300
+    scatter = np.sqrt(np.maximum(mean_square - between, 0.0)) + 1e-300
     centre = low + (np.arange(RESIDUAL_BINS) + 0.5) * (high - low) / RESIDUAL_BINS
     return _BinnedMean(centre, mean, scatter / np.sqrt(count)[:, None])
 
@@ -193,10 +202,13 @@ def covariates(found: list[Residual], wander: Values) -> dict[str, _BinnedMean]:
     Of the components of the specific force only the one with the largest excess is returned.
     """
     out: dict[str, _BinnedMean] = {}
+    errors: dict[tuple[int, ...], tuple[Values, Mask, Values]] = {}  # by the recordings that have a covariate
     for label, value in COVARIATES.items():
-        pairs = [(v, r.error) for r in found if (v := value(r)) is not None]
-        if pairs:
-            binned = _binned_mean(np.concatenate([v for v, _ in pairs]), np.concatenate([e for _, e in pairs]))
+        values = {i: v for i, r in enumerate(found) if (v := value(r)) is not None}
+        if values:
+            if (used := tuple(values)) not in errors:
+                errors[used] = _of_errors(np.concatenate([found[i].error for i in used]))
+            binned = _binned_mean(np.concatenate([*values.values()]), *errors[used])
             out |= {label: binned} if binned else {}
     order = sorted(out, key=lambda label: -out[label].excess(wander))
     forces = [label for label in order if label.startswith("specific force")]
