@@ -19,6 +19,7 @@ import os
 import re
 from collections.abc import Callable
 from contextlib import contextmanager
+from json.encoder import encode_basestring
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -44,18 +45,19 @@ Check = Callable[[Any], Any]
 
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file under a temporary name in its folder, which is created, flush it to the disk, then rename it."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    folder, name = os.path.split(path)
+    temporary = os.path.join(folder, f".{name}.{os.getpid()}.tmp")  # noqa: PTH118  (a fleet has thousands of files)
     try:
-        stream = temporary.open("wb")
+        stream = open(temporary, "wb")  # noqa: PTH123, SIM115
     except FileNotFoundError:
         path.parent.mkdir(parents=True, exist_ok=True)
-        stream = temporary.open("wb")
+        stream = open(temporary, "wb")  # noqa: PTH123, SIM115
     with stream:
         stream.write(content.encode() if isinstance(content, str) else content)
         if not _flushed_at_end:
             stream.flush()
             os.fsync(stream.fileno())
-    temporary.replace(path)
+    os.replace(temporary, path)  # noqa: PTH105
 
 
 def state_of_files(files: Iterable[Path]) -> str:
@@ -107,7 +109,7 @@ def json_text(value: Any, levels: int = 3, indent: str = "\n") -> str:  # noqa: 
     if levels and isinstance(value, dict | list) and value:
         members = list(value.values() if isinstance(value, dict) else value)
         if any(isinstance(member, dict | list | tuple) for member in members):
-            names = [f"{_encoded(str(name))}: " for name in value] if isinstance(value, dict) else [""] * len(members)
+            names = [f"{encode_basestring(str(name))}: " for name in value] if isinstance(value, dict) else [""] * len(members)
             inner = indent + " "
             lines = [name + json_text(m, levels - 1, inner) for name, m in zip(names, members, strict=True)]
             opening, closing = "{}" if isinstance(value, dict) else "[]"

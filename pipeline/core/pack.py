@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, cast
 
+from imu_logs.units import SENSORS
 from pipeline.core.errors import DamagedFileError
 from pipeline.core.files import WRITE_AGAIN, json_text
 
@@ -180,6 +181,14 @@ class Batch:
             pack, name = self.member(path, unit)
             yield path, pack.read(name)
 
+    @cached_property
+    def _exports(self) -> dict[str, list[str]]:
+        """Members of the pack of exports by unit."""
+        found: dict[str, list[str]] = {}
+        for name in self.packs["export"].names():
+            found.setdefault(name.partition("/")[0], []).append(name)
+        return found
+
     def _paths(self, unit: str) -> Iterator[str]:
         """Yield the paths of the published files of a unit, relative to the results; those of its lot's prior last."""
         yield f"reports/{unit}.html"
@@ -187,13 +196,11 @@ class Batch:
             yield f"calibrations/{unit}.json"
             return
         yield from (f"{folder}/{unit}.json" for folder in DOCUMENT_FOLDERS)
-        parts = self.packs["diagnose"].json(f"{unit}.json").values()
-        yield from (
-            f"diagnoses/{p['suggested_file']}" for p in parts if isinstance(p, dict) and p.get("suggested_file")
-        )
+        suggested = (f"{unit}_{sensor}_unknown.yaml" for sensor in SENSORS)
+        yield from (f"diagnoses/{name}" for name in suggested if name in self.packs["diagnose"])
         certificates = (f"certificates/{unit}.{kind}" for kind in ("json", "html", "xml"))
         yield from (path for path in certificates if path in self.packs["report"])  # .xml is not always written
-        yield from (f"exports/{name}" for name in self.packs["export"].names() if name.startswith(f"{unit}/"))
+        yield from (f"exports/{name}" for name in self._exports.get(unit, ()))
         names = self.combined.names() if self.combined else ()
         yield from (name.removeprefix(f"{unit}/") for name in names if name.startswith(f"{unit}/"))
 

@@ -149,7 +149,7 @@ def identify_noise(recordings: Sequence[Recording], *, full: bool = True) -> dic
     documents: dict[str, JSON] = {}
     same_sampling: dict[tuple[Any, ...], list[tuple[str, Regression]]] = {}
     for sensor in SENSORS:
-        document, stretches = _source(sensor, recordings)
+        document, stretches = _source(sensor, recordings, warm=full)
         documents[sensor] = document
         if not stretches:
             continue
@@ -172,8 +172,11 @@ def identify_noise(recordings: Sequence[Recording], *, full: bool = True) -> dic
     return documents
 
 
-def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[RestStretch]]:
-    """Return the document of a sensor's noise so far and its stretches, or no stretches and the reason."""
+def _source(sensor: str, recordings: Sequence[Recording], *, warm: bool) -> tuple[JSON, list[RestStretch]]:
+    """Return the document of a sensor's noise so far and its stretches, or no stretches and the reason.
+
+    ``warm``: with the temperatures of static recordings, which only intervals need.
+    """
     known = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
     empty: JSON = {"unit": SENSOR_UNITS[sensor], "source": None, "reason": None, "axes": None}
     if not known:
@@ -183,7 +186,7 @@ def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[Re
         reason = f"the sampling intervals scatter by more than {MOST_JITTER:.0%}"
         return empty | {"reason": f"{reason}: equal counts of samples are not equal times"}, []
     static, others = ([r for r in even if (r.role == "static") == is_static] for is_static in (True, False))
-    source, chosen, stretches = "static", static, [s for r in static for s in static_stretches(sensor, r)]
+    source, chosen, stretches = "static", static, [s for r in static for s in static_stretches(sensor, r, warm=warm)]
     if _samples(stretches) < MIN_SPECTRUM_SAMPLES and others:
         rests = [each for r in others for each in rest_readings(r, sensor, whole_recording=False)]
         stretches = [RestStretch(time, reading) for time, reading in rests if len(time) >= SHORTEST_STRETCH]
@@ -217,13 +220,13 @@ def _samples(stretches: Sequence[RestStretch]) -> int:
     return sum(len(s.time) for s in stretches)
 
 
-def static_stretches(sensor: str, recording: Recording) -> list[RestStretch]:
+def static_stretches(sensor: str, recording: Recording, *, warm: bool = True) -> list[RestStretch]:
     """Return the evenly sampled stretches of a static recording; straight lines fill gaps of up to ``LONGEST_FILL``."""
     values = recording.reading(sensor)
     assert values is not None  # noqa: S101
     good = np.flatnonzero(usable(recording, values))
-    warm = recording.temperature
-    warm = temperature_of(recording) if warm is not None and np.isfinite(warm).all() else None
+    logged = recording.temperature
+    warmth = temperature_of(recording) if warm and logged is not None and np.isfinite(logged).all() else None
     step = np.diff(recording.time[good]) / recording.interval
     steps = np.where(step > GAP_INTERVALS, np.rint(step), 1).astype(int)
     stretches = []
@@ -234,7 +237,7 @@ def static_stretches(sensor: str, recording: Recording) -> list[RestStretch]:
         grid, rows = np.arange(place[-1] + 1), good[index]
         reading = np.stack([np.interp(grid, place, values[rows, c]) for c in range(3)], axis=1)
         time = np.linspace(recording.time[rows[0]], recording.time[rows[-1]], len(grid))
-        stretches.append(RestStretch(time, reading, None if warm is None else np.interp(grid, place, warm[rows])))
+        stretches.append(RestStretch(time, reading, None if warmth is None else np.interp(grid, place, warmth[rows])))
     return stretches
 
 

@@ -32,6 +32,10 @@ SETTINGS = settings_of(sensor=dict.fromkeys(SENSORS, SHEET))
 SHEETS = dict.fromkeys(SENSORS, SensorFigures.of(SETTINGS.sensor.gyroscope))
 
 
+def noise_of(sheets: dict[str, SensorFigures], document: dict[str, Any]) -> dict[str, float | None]:
+    return noise(ExportedUnit(document, sheets).noise_figures)
+
+
 def document(readings: dict[str, Any] | None = None) -> dict[str, Any]:
     found: dict[str, Any] = {"unit": "U1", "schema_version": 1, "status": "ok", "sensor": "mpu6050"}
     found["inputs"] = [{"rate_hz": RATE}]
@@ -96,7 +100,7 @@ def test_the_variances_of_vins_are_those_of_the_integrals_of_the_recording(measu
 
 
 def test_without_a_rest_the_configuration_is_exported_and_what_is_unknown_is_null() -> None:
-    found = noise(SHEETS, document())
+    found = noise_of(SHEETS, document())
     assert found["gyroscope_noise_density"] == pytest.approx(1e-3 / np.sqrt(2.0) * np.pi / 180.0)
     assert found["gyroscope_random_walk"] == pytest.approx(1e-4 * np.sqrt(0.02) * np.pi / 180.0)
     unknown = dict.fromkeys(SENSORS, SensorFigures(wander_time_s=100.0))
@@ -110,7 +114,7 @@ def test_a_walk_that_was_not_seen_is_at_most_its_upper_limit() -> None:
     quiet = document({s: SIGMA[s] * rng.standard_normal((SAMPLES, 3)) for s in SENSORS})
     limits = [quiet["noise"]["gyroscope"]["axes"][a]["terms"]["random_walk"]["upper_limit"] for a in "xyz"]
     loud = {s: replace(sheet, bias_wander=10.0) for s, sheet in SHEETS.items()}
-    found = noise(loud, quiet)["gyroscope_random_walk"]
+    found = noise_of(loud, quiet)["gyroscope_random_walk"]
     assert found == pytest.approx(np.sqrt(np.mean(np.square(limits))) * np.pi / 180.0)
     text = export("kalibr_imu.yaml", ExportedUnit(quiet, loud))["kalibr_imu.yaml"]
     assert "gyroscope, walk:" in text
@@ -128,7 +132,7 @@ def test_a_process_is_white_or_a_walk_by_its_correlation_time_and_flicker_meets_
         made = document() | {
             "noise": {"accelerometer": {"source": "static", "length_s": 1e3, "axes": {"x": terms(**given)}}}
         }
-        found = noise(SHEETS, made)
+        found = noise_of(SHEETS, made)
         return tuple(found[f"accelerometer_{k}"] / G0 for k in ("noise_density", "random_walk"))  # type: ignore[return-value,operator]
 
     for time in (0.01, 30.0):
@@ -155,7 +159,7 @@ def test_a_simulated_short_process_is_exported_as_its_plateau() -> None:
     values = 0.01 * rng.standard_normal((SAMPLES, 3)) + 0.2 * lfilter([1.0], [1.0, -keep], drive, axis=0)
     made = document(dict.fromkeys(SENSORS, values))
     assert made["noise"]["gyroscope"]["axes"]["x"]["terms"]["gauss_markov"]
-    found = noise(SHEETS, made)["gyroscope_noise_density"]
+    found = noise_of(SHEETS, made)["gyroscope_noise_density"]
     seconds = values.reshape(-1, 50, 3).mean(axis=1)  # means over 1 s scatter by the density
     assert found == pytest.approx(np.radians(seconds.std()), rel=0.05)
 
@@ -170,8 +174,8 @@ def test_noise_that_no_composition_fits_is_exported_as_doubtful() -> None:
 def test_a_conversion_keeps_the_densities(measured: dict[str, Any], tmp_path: Path) -> None:
     export_all(measured, SETTINGS, tmp_path)
     found = read_any(tmp_path / "kalibr.yaml")
-    again = noise(with_noise({}, found), document_of(found))
-    assert again == pytest.approx(noise(SHEETS, measured), rel=1e-9)
+    again = noise_of(with_noise({}, found), document_of(found))
+    assert again == pytest.approx(noise_of(SHEETS, measured), rel=1e-9)
 
 
 def test_the_walk_of_a_short_process_holds_at_the_longest_time_measured() -> None:
@@ -181,7 +185,7 @@ def test_the_walk_of_a_short_process_holds_at_the_longest_time_measured() -> Non
     drive = np.sqrt(1.0 - keep**2) * rng.standard_normal((SAMPLES, 3))
     values = 0.1 * rng.standard_normal((SAMPLES, 3)) + size * lfilter([1.0], [1.0, -keep], drive, axis=0)
     made = document(dict.fromkeys(SENSORS, values))
-    found = noise(SHEETS, made)
+    found = noise_of(SHEETS, made)
     factor = np.pi / 180.0
     walk, white = (found[f"gyroscope_{k}"] / factor for k in ("random_walk", "noise_density"))  # type: ignore[operator]
     averages = values[: SAMPLES // 9 * 9].reshape(9, -1, 3).mean(axis=1)  # of the longest averaging time, 133 s

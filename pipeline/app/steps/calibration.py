@@ -203,9 +203,9 @@ def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     for sensor, key in (("accelerometer", "specific_force_g"), ("gyroscope", "angular_rate_dps")):
-        own = [r for r in recordings if r.role in {sensor, "rests"} and r.valid.any()]
-        sizes = [np.linalg.norm(v[r.valid], axis=1).max() for r in own if (v := r.reading(sensor)) is not None]
-        found |= {key: round(float(max(sizes)), 6)} if sizes else {}
+        own = [(r.reading(sensor), r.valid) for r in recordings if r.role in {sensor, "rests"}]
+        squares = [np.sum(v**2, axis=1)[valid].max() for v, valid in own if v is not None and valid.any()]
+        found |= {key: round(float(np.sqrt(max(squares))), 6)} if squares else {}
     warm = [r for r in recordings if r.role in {*SENSORS, "rests"} and r.temperature is not None and r.samples]
     for key, chosen in (("temperature_degc", warm), ("soaked_degc", [r for r in warm if r.kind == "soak"])):
         if chosen:

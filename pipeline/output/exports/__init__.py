@@ -8,6 +8,7 @@ and how ``convert`` reads it), and the text of the file in Jinja2. The text has 
     remarks                    convention, omitted quantities, the remaining error, the held-out errors
     unit, document             name of the unit, its calibration
     sheets, gravity_g          figures of each sensor (``sensors.SensorFigures``); local gravity, g
+    noise                      ``sensors.noise``, of a format with ``noise: true``
 
 the functions of ``sensors.TEMPLATE_FUNCTIONS``, and the filters ``comment``, ``json``, ``yaml``, ``numbers``. The name
 of the template without ``.j2`` is the name of the format and, by default, of its file.
@@ -25,7 +26,7 @@ import json
 import re
 from dataclasses import MISSING, dataclass, field, replace
 from dataclasses import fields as dataclass_fields
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -35,13 +36,14 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from pipeline.core.compiled_templates import CompiledTemplates
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import JSON, Check, WrongValueError, each, fields, one_of
-from pipeline.core.records import SENSORS, FittedEffect, Reduced, SensorCalibration
+from pipeline.core.records import SENSORS, FittedEffect, Quantities, Reduced, SensorCalibration
 from pipeline.output.exports.sensors import (
     TEMPLATE_FUNCTIONS,
     UNIT_FACTORS,
     ExportedSensor,
     SensorFigures,
     before_use,
+    noise,
     noise_figures,
     plain,
 )
@@ -157,6 +159,7 @@ class ExportedUnit:
     gravity_g: float = 1.0
     validation: JSON | None = None
     diagnosis: JSON | None = None
+    made: Quantities = field(default_factory=Quantities)  # sensors by what formats hold
 
     @cached_property
     def calibrations(self) -> dict[str, SensorCalibration]:
@@ -170,23 +173,20 @@ class ExportedUnit:
 
     def sensors(self, declared: Format) -> dict[str, ExportedSensor]:
         """Return the calibrated sensors in the units of a format."""
-        units = declared.units
-        return {
-            s: ExportedSensor(c, units[s], self.sheets.get(s), self._held(c, declared))
-            for s, c in self.calibrations.items()
-            if s in units
-        }
+        found, included = {}, {*declared.effects, *declared.effects_in_part}
+        for s, calibration in self.calibrations.items():
+            if s in declared.units:
+                own = frozenset(e.name for e in sensor_effects(calibration))
+                key = s, declared.units[s], declared.matrix.get(s, "full"), own if "all" in included else own & included
+                found[s] = self.made.once(key, partial(self._sensor, *key))
+        return found
 
-    def _held(self, calibration: SensorCalibration, declared: Format) -> Reduced | None:
-        """Return what a format holds of a calibration that it cannot hold; None where it does, or nothing is known."""
-        sensor = calibration.sensor
-        included = {*declared.effects, *declared.effects_in_part}
-        own = {e.name for e in sensor_effects(calibration)}
-        kept = own if "all" in included else own & included
-        for entry in ((self.validation or {}).get(sensor) or {}).get("reduced", ()):
-            if entry["part"] == declared.matrix.get(sensor, "full") and set(entry["effects"]) == kept:
-                return Reduced(**entry)
-        return None
+    def _sensor(self, sensor: str, unit: str, part: str, kept: frozenset[str]) -> ExportedSensor:
+        """Return a sensor with this part of the matrix and these effects: formats that hold the same share it."""
+        entries = ((self.validation or {}).get(sensor) or {}).get("reduced", ())
+        held = next((e for e in entries if e["part"] == part and {*e["effects"]} == kept), None)
+        reduced = held and Reduced(**held)
+        return ExportedSensor(self.calibrations[sensor], unit, self.sheets.get(sensor), reduced)
 
     def held_out_errors(self, *, less: bool) -> dict[tuple[str, str], float]:
         """Return the held-out rms error of each sensor and file; ``less``: of those that hold less alone."""
@@ -241,6 +241,7 @@ def _rendered(declared: Format, template: Template, exported: ExportedUnit) -> s
         document=exported.document,
         sheets=exported.sheets,
         gravity_g=exported.gravity_g,
+        noise=noise(exported.noise_figures) if declared.noise else None,
         remarks=_remarks(declared, sensors, exported),
     )
 

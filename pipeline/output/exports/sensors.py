@@ -66,13 +66,12 @@ class SensorFigures:
         return cls(**{f.name: getattr(data_sheet, f.name) for f in fields(cls) if f.name != "noise_origin"})
 
 
-def noise(sheets: Mapping[str, SensorFigures], document: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return Kalibr's four noise parameters in m/s^2 and rad/s; None for unknown ones."""
+def noise(figures: Mapping[str, JSON]) -> dict[str, float | None]:
+    """Return Kalibr's four noise parameters in m/s^2 and rad/s; None for unknown ones; by ``noise_figures``."""
     parameters: dict[str, float | None] = {}
-    for sensor in SENSORS:
-        figures = noise_figures(sensor, sheets.get(sensor), document)
+    for sensor, known in figures.items():
         for name, key in (("noise_density", "white"), ("random_walk", "walk")):
-            value = figures[key]
+            value = known[key]
             parameters[f"{sensor}_{name}"] = None if value is None else float(value * UNIT_FACTORS[SI[sensor]])
     return parameters
 
@@ -388,7 +387,6 @@ TEMPLATE_FUNCTIONS: dict[str, Any] = {
     "matmul": np.matmul,
     "lower_half": np.triu_indices(3)[::-1],  # column by column
     "nearest_density": nearest_density,
-    "noise": noise,
     "scaled": lambda value, factor: None if value is None else float(value * factor),
     "sqrt": np.sqrt,
     "pose": pose,
