@@ -1,6 +1,6 @@
 """Errors of bias and matrix with one effect at its limit, against U and U with the open effects, in-process.
 
-    nice python benchmarks/open_effects.py [--units 2] [--procedure ferraris six_positions ...] [--none]
+    nice python benchmarks/open_effects.py [--units 2] [--procedure ferraris ...] [--none] [--figures FILE]
 
 Every unit has one effect of its sensor file at the limit, with random signs; ``--none``: no effect. Prints for each
 procedure the share of the parameters within U, within ``uncertainty_with_open``, and the largest error over the latter,
@@ -12,17 +12,23 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+import pandas as pd
 
+from imu_research.figures import MeasuredFigure, clustered_share, share, write_figures
 from pipeline.app.one_unit import unit_of_recordings, unit_row
 from pipeline.core.records import SENSORS
 from pipeline.estimation.uncertainty_budget import limited_effects
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 
+SILENT = {"nothing_missing", "not_enough_data"}  # verdicts
+MOST_OVER_WIDE = 5.0  # times the uncertainty with the open effects
 WITHOUT_CASE = ("six_positions", "orientations_24", "multi_position")
 PROCEDURES = {
     "ferraris": {"interval_s": 0.02},
@@ -76,6 +82,15 @@ def errors_of(procedure: str, effect: str, limit: np.ndarray | None, seed: int) 
     return found
 
 
+def rows_of(procedure: str, effect: str, limit: np.ndarray | None, seed: int) -> list[dict]:
+    """Return ``errors_of`` a unit; empty, and a line, where it is refused."""
+    try:
+        return errors_of(procedure, effect, limit, seed)
+    except Exception as error:  # noqa: BLE001
+        print(procedure, effect, type(error).__name__, str(error)[:150])
+        return []
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -83,7 +98,9 @@ def main() -> None:
     parser.add_argument("--procedure", nargs="+", default=list(PROCEDURES), choices=list(PROCEDURES))
     parser.add_argument("--none", action="store_true")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--cores", type=int, default=1)
     parser.add_argument("--told", action="store_true", help="list the units that are not said to lack nothing")
+    parser.add_argument("--figures", type=Path, help="file for the shares with their 99 % intervals, clustered by unit")
     options = parser.parse_args()
     settings = unit_row(["sensor=mpu6050"]).config.sensor
     effects = {
@@ -91,34 +108,37 @@ def main() -> None:
         for s in SENSORS
         for this, start, limits in limited_effects(s, (), settings.of(s))
     }
+    figures: list[MeasuredFigure] = []
     for procedure in options.procedure:
-        rows = []
-        for number, (name, limit) in enumerate(effects.items()):
-            for k in range(options.units):
-                seed = 1000 * options.seed + 50 * number + k
-                try:
-                    rows += errors_of(procedure, name, None if options.none else limit, seed)
-                except Exception as error:  # noqa: BLE001
-                    print(procedure, name, type(error).__name__, str(error)[:150])
-        silent = [r for r in rows if r["verdict"] in {"nothing_missing", "not_enough_data"}]
-        told = [r for r in rows if r["verdict"] not in {"nothing_missing", "not_enough_data"}]
-        within = [
-            np.mean(np.concatenate([r["error"] <= r["U"] + share * r["line"] for r in silent])) for share in (0, 1)
+        tasks = [
+            (procedure, name, None if options.none else limit, 1000 * options.seed + 50 * number + k)
+            for number, (name, limit) in enumerate(effects.items())
+            for k in range(options.units)
         ]
+        with ProcessPoolExecutor(options.cores) as pool:
+            by_unit = [found for found in pool.map(rows_of, *zip(*tasks, strict=True)) if found]
+        rows = [row for found in by_unit for row in found]
+        silent, told = ([r for r in rows if (r["verdict"] in SILENT) == unsaid] for unsaid in (True, False))
+        of_silent = [
+            np.concatenate([r["error"] <= r["U"] + r["line"] for r in found if r["verdict"] in SILENT] or [np.ones(0)])
+            for found in by_unit
+        ]
+        figures += clustered_share(f"{procedure}: within U and the line of its effect", of_silent, ">= 95 %")
+        far = pd.Series([bool(np.max(r["error"] / r["wide"]) <= MOST_OVER_WIDE) for r in silent], dtype=bool)
+        figures += share(f"{procedure}: none off by more than 5 times U with the open effects", far, ">= 100 %")
+        within = np.mean(np.concatenate([r["error"] <= r["U"] for r in silent]))
         wide = np.mean(np.concatenate([r["error"] <= r["wide"] for r in silent]))
         cpu, ratio = np.mean([r["cpu_s"] for r in rows]), np.median(np.concatenate([r["wide"] / r["U"] for r in rows]))
         print(f"{procedure}: {len(silent)} of {len(rows)} silent; CPU {cpu:.2f} s a unit; U with open {ratio:.2f} U")
-        print(f"   within U {within[0]:.3f}, U + line {within[1]:.3f}, U with open {wide:.3f}")
+        print(f"   within U {within:.3f}, U with open {wide:.3f};", figures[-2].cells)
         for r in sorted(silent, key=lambda r: -np.max(r["error"] / r["wide"]))[:6]:
             over = [np.max(r["error"] / r[key]) for key in ("U", "wide")]
             said = f"{over[0]:.1f} U, {over[1]:.2f} of U with open, {r['verdict']}"
             print(f"   {r['sensor']} with {r['effect']}: {said}, line {'yes' if r['line'].any() else 'no'}")
-        print(
-            "   told:",
-            sorted({(r["sensor"][:4], r["effect"], r["verdict"], ",".join(r["selected"])) for r in told})
-            if options.told
-            else len(told),
-        )
+        causes = sorted({(r["sensor"][:4], r["effect"], r["verdict"], ",".join(r["selected"])) for r in told})
+        print("   told:", causes if options.told else len(told), flush=True)
+    if options.figures:
+        write_figures(options.figures, figures)
 
 
 if __name__ == "__main__":
