@@ -42,7 +42,7 @@ def min_delta_bic(this: Effect, sensor: str, selected_gain: float = 0.0) -> floa
     ``selected_gain``: G, 0 if no effect is selected.
     """
     least = MIN_DELTA_BIC_OF_SLOW if this.of_the_room(sensor) else MIN_DELTA_BIC
-    return float(np.clip(ERROR_OF_FIRST_ORDER * selected_gain, least, MAX_MIN_DELTA_BIC))
+    return min(max(ERROR_OF_FIRST_ORDER * selected_gain, least), MAX_MIN_DELTA_BIC)
 
 
 def passes(score: Score, sensor: str, candidates: int, selected_gain: float = 0.0) -> bool:

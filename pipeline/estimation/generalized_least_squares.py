@@ -237,7 +237,7 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     kept = values > MIN_EIGENVALUE_SHARE * values[:, -1:]
     half = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :] / unit[:, :, None]
     determinants = np.sum(np.log(np.where(kept, values, 1.0)), axis=1) + 2.0 * np.sum(np.log(unit), axis=1)
-    steps = np.einsum("gpi,gqi,gq->gp", half, half, rhs, optimize=True)
+    steps = (half @ (half.transpose(0, 2, 1) @ rhs[..., None]))[..., 0]
     rss = np.maximum(np.maximum(products[:, -1, -1] - np.sum(steps * rhs, axis=1), 0.0) + within, 1e-300)
     scores = -0.5 * n * np.log(rss / n) - 0.5 * logarithms + np.array([s.prior for s in settings])
     covariances = half @ half.transpose(0, 2, 1) / np.outer(size, size) * (rss / spare)[:, None, None]

@@ -341,6 +341,12 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
 
     ``hidden``: effects that the recordings cannot show. ``others``: further candidates.
     """
+    of_fit = selection.fit.key, tuple(selection.names), selection.data_sheet.model_dump_json()
+    key = posterior, *of_fit, frozenset(hidden), tuple(this.name for this in others)
+    return selection.observations.once(key, lambda: _posterior(selection, hidden, others))
+
+
+def _posterior(selection: Selection, hidden: Collection[str], others: Sequence[Effect]) -> Answers:
     sensor = selection.observations.sensor
     candidates = {term.effect.name: term for term in reversed(selection.first.candidates)}
     shown = {*(candidates.keys() - set(hidden)), *selection.names}

@@ -20,7 +20,7 @@ from pipeline.estimation.design import Design, EffectColumns, Start
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, random_walks
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 
     from pipeline.core.records import Index, Values
     from pipeline.estimation.observations import Observations
@@ -90,11 +90,13 @@ class Ranking:
         self.projected = self.with_walks[of_settings]
         self.spans = [slice(s.start - known, s.stop - known) for s in design.slices[len(configured) :]]
         size = np.where(design.sizes() > 0, design.sizes(), 1.0)[known:]
-        self.blocks: list[Values] = []
-        for span in self.spans:
-            values, vectors = np.linalg.eigh(self.projected[0, span, span] / np.outer(size[span], size[span]))
-            kept = values > MIN_NEW_COLUMN_SHARE**2
-            self.blocks.append(vectors[:, kept] / np.sqrt(values[kept]) / size[span, None])
+        unit = self.projected[0] / (size[:, None] * size)
+        self.blocks: list[Values] = [np.zeros(0)] * len(self.spans)
+        for members in _by_size([span.stop - span.start for span in self.spans]):
+            decomposed = np.linalg.eigh(np.stack([unit[self.spans[j], self.spans[j]] for j in members]))
+            for j, values, vectors in zip(members, *decomposed, strict=True):
+                kept = values > MIN_NEW_COLUMN_SHARE**2
+                self.blocks[j] = vectors[:, kept] / np.sqrt(values[kept]) / size[self.spans[j], None]
         ends = np.cumsum([block.shape[1] for block in self.blocks]).tolist()
         self.places = [np.arange(end - block.shape[1], end) for block, end in zip(self.blocks, ends, strict=True)]
 
@@ -148,12 +150,10 @@ class Ranking:
         products = self.chosen(selected)
         before = float(self.log_likelihood(products[:, -1, -1])[1:].max())
         names = {self.candidates[j].effect.name for j in selected}
-        by_size: dict[int, list[int]] = {}  # candidates with equal numbers of directions are solved together
-        for j, term in enumerate(self.candidates):
-            if len(self.places[j]) and term.effect.name not in names:
-                by_size.setdefault(len(self.places[j]), []).append(j)
+        able = [j for j, term in enumerate(self.candidates) if len(self.places[j]) and term.effect.name not in names]
         scores = {}
-        for members in by_size.values():
+        for index in _by_size([self.blocks[j].shape for j in able]):
+            members = [able[k] for k in index]
             for j, score, likelihoods in self._scored(members, products, before, limits):
                 scores[j], self._with[*selected, j] = score, likelihoods
         best: dict[str, Score] = {}
@@ -177,13 +177,18 @@ class Ranking:
         rss = products[:, -1, -1] - np.sum(cross * solved, axis=2)
         likelihood = self.log_likelihood(rss)
         weakest = np.linalg.eigvalsh(inner[:, 0])[:, 0]
+        likeliest, row = np.argmax(likelihood[:, 1:], axis=1) + 1, np.arange(len(members))
+        blocks, signals = np.stack([self.blocks[j] for j in members]), solved[row, likeliest]
+        linear, variance = (blocks @ signals[..., None])[..., 0], np.maximum(rss[row, likeliest], 0.0) + self.within
+        covariances = blocks @ np.linalg.solve(definite[row, likeliest], blocks.transpose(0, 2, 1))
+        uncertainties = standard_uncertainty(covariances * (variance / self.samples)[:, None, None])
         for i, j in enumerate(members):
-            this = self.candidates[j].effect
-            best = int(np.argmax(likelihood[i, 1:])) + 1
+            term, this, best, signal = self.candidates[j], self.candidates[j].effect, int(likeliest[i]), signals[i]
             k = inner.shape[-1] + (0 if this.moves else len(this.nonlinear))
             gain = max(2.0 * (float(likelihood[i, best]) - before), 0.0)
-            values, uncertainty = self._estimate(j, solved[i, best], definite[i, best], rss[i, best])
-            signal = solved[i, best]
+            values, uncertainty, at = term.values.copy(), np.zeros(len(term.values)), slice(0, len(linear[i]))
+            values[at] = linear[i] + (term.values[at] if this.moves else 0.0)
+            uncertainty[at] = uncertainties[i]
             score = Score(
                 this.name,
                 delta_bic=gain - k * float(np.log(self.samples)),
@@ -197,17 +202,6 @@ class Ranking:
                 drop=float(2.0 * signal @ cross[i, 0] - signal @ inner[i, 0] @ signal),
             )
             yield j, score, likelihood[i]
-
-    def _estimate(self, j: int, solved: Values, inner: Values, rss: float) -> tuple[Values, Values]:
-        """Return the parameters and their standard uncertainties from the reduced coefficients."""
-        term, block = self.candidates[j], self.blocks[j]
-        variance = (max(rss, 0.0) + self.within) / self.samples
-        covariance = block @ np.linalg.solve(inner, block.T) * variance
-        values, uncertainty = term.values.copy(), np.zeros(len(term.values))
-        linear = slice(0, len(block))
-        values[linear] = block @ solved + (term.values[linear] if term.effect.moves else 0.0)
-        uncertainty[linear] = standard_uncertainty(covariance)
-        return values, uncertainty
 
     def shares(self, j: int, selected: Sequence[int], setting: int) -> dict[str, float]:
         """Return the share of candidate j's fitted signal that each other effect reproduces.
@@ -240,16 +234,28 @@ class Ranking:
 
     def explained(self) -> Values:
         """Return the decrease of the base's whitened sum of squares by each candidate, white noise: (c,) array."""
-        products = self.products[0]
+        products, found = self.products[0], np.zeros(len(self.places))
         definite = products + UNIT_COLUMN_RIDGE * np.eye(len(products))
-        solved = [np.linalg.solve(definite[np.ix_(at, at)], products[at, -1]) for at in self.places]
-        return np.array([float(products[at, -1] @ x) for at, x in zip(self.places, solved, strict=True)])
+        for members in _by_size([len(at) for at in self.places]):
+            at = np.stack([self.places[j] for j in members])
+            cross = products[at, -1]
+            solved = np.linalg.solve(definite[at[:, :, None], at[:, None]], cross[..., None])[..., 0]
+            found[members] = np.sum(cross * solved, axis=1)
+        return found
 
     def visibility(self, j: int, limits: Values) -> Values:
         """Return the expected gain in 2 log L of an effect whose parameters are all at their limits: (t,) array."""
         block = self.spans[j]
         squares = np.einsum("tii->ti", self.projected[:, block, block])
         return np.asarray(np.sum(limits[: squares.shape[1]] ** 2 * squares, axis=1))
+
+
+def _by_size(sizes: Iterable[Hashable]) -> Iterable[list[int]]:
+    """Return the indices of equal sizes, which are computed together."""
+    found: dict[Hashable, list[int]] = {}
+    for j, size in enumerate(sizes):
+        found.setdefault(size, []).append(j)
+    return found.values()
 
 
 def without(products: Values, index: Index) -> Values:

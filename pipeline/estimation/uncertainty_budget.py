@@ -44,6 +44,7 @@ import numpy as np
 from pipeline.core.records import (
     AFTER_BASE,
     BASE,
+    BASE_COUNT,
     BASE_NAMES,
     BIAS,
     LIMIT,
@@ -72,7 +73,7 @@ from pipeline.estimation.monte_carlo import through, with_trials
 from pipeline.estimation.multi_position.model import motion_at_rests
 from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 from pipeline.physics.effects import catalogue, effect
-from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Owner
+from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Layout, Owner
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -140,12 +141,17 @@ def changes_on_table(
     for this, start, limits in limited_effects(sensor, modelled, data_sheet):
         if not all(this.available(motion) for motion in motions):
             continue
+        term = EffectColumns(this, start)  # limits of nonlinear parameters are 0
         if this.of_samples:
-            columns = columns_of_samples(EffectColumns(this, start, full=True), sensor, joined, K)
+            columns = columns_of_samples(term, sensor, joined, K)
         else:
-            columns = np.concatenate([this.columns(sensor, motion, K, start) for motion in motions])
-        pairs = zip(fit.derivative, fit.weights, columns.transpose(1, 0, 2), strict=True)
-        keep_larger(found, this.name, (sum(J @ (A @ z) for J, A, z in pairs) * limits)[BASE])
+            columns = np.concatenate([term.regressors(sensor, motion, K) for motion in motions])
+        of_axes = [columns] * 3 if columns.ndim == 2 else columns.transpose(1, 0, 2)
+        each = [J[BASE] @ (A @ z) for J, A, z in zip(fit.derivative, fit.weights, of_axes, strict=True)]
+        change = sum(each) if term.layout() == Layout.SHARED else np.concatenate(each, axis=1)
+        full = np.zeros((BASE_COUNT, len(limits)))
+        full[:, : change.shape[1]] = change
+        keep_larger(found, this.name, full * limits)
     return found
 
 

@@ -72,8 +72,8 @@ def coverage_factor(degrees_of_freedom: ArrayLike, probability: float = 0.95) ->
 
 
 def standard_uncertainty(covariance: Values) -> Values:
-    """Return the standard uncertainties of a (p, p) covariance: (p,) array; rounding below 0 counts as 0."""
-    return np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    """Return the standard uncertainties of (..., p, p) covariances: (..., p) array; rounding below 0 counts as 0."""
+    return np.sqrt(np.clip(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0, None))
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,9 @@ lists, by complexity, the forms that gain more than all simpler ones.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import chain, combinations, count, pairwise, starmap
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +50,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.observations import Observations
     from pipeline.evaluation.diagnosis.findings import DiagnosisInput
     from pipeline.evaluation.diagnosis.functional_forms import Factor
+
+    KnownColumns = dict[tuple[tuple[tuple[str, ...], ...], int], tuple[int, Values]]
 
 PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
 # least delta BIC of a further term over that of the first: less may be rounding of the first's constants
@@ -83,50 +86,31 @@ class ScoredForm:
         return self.score > (MAX_MIN_DELTA_BIC if self.form.signals <= {"time", "temperature"} else MIN_DELTA_BIC)
 
 
-class FormColumns:
-    """Products of factors on an axis, each once."""
-
-    def __init__(self, grammar: Forms) -> None:
-        self.grammar = grammar
-        self.known: dict[tuple[tuple[tuple[str, ...], ...], int], tuple[int, Values]] = {}
-
-    def place(self, parts: Sequence[tuple[Factor, tuple[str, ...]]], axis: int) -> int:
-        """Return the place of a product; each part is the sum of some formulas of a factor."""
-        axis = axis if any(factor.signal == "u" for factor, _ in parts) else 0
-        key = tuple(texts for _, texts in parts), axis
-        if key not in self.known:
-            column = np.ones(len(self.grammar.selection.observations.weight))
-            for factor, texts in parts:
-                values = [self.grammar.column(text, factor) for text in texts]
-                column = column * np.sum([each[:, axis % each.shape[1]] for each in values], axis=0)
-            self.known[key] = len(self.known), column
-        return self.known[key][0]
-
-    def stacked(self) -> Values:
-        """Return the columns: (n, q) array."""
-        return np.stack([column for _, column in self.known.values()], axis=1)
-
-
 class FormProducts:
     """Forms as products f g of two kinds of columns F and G, and block means and squares of all these products.
 
     The products themselves are not computed: the sums of ``w f g`` in a block are ``F^T (w G)``, those of ``w f^2 g^2``
-    are ``(F^2)^T (w G^2)``.
-
-    ``apart``: whether the columns are those of factors and modulators; else those of the forms, and 1.
+    are ``(F^2)^T (w G^2)``. ``apart``: whether F are factors and G modulators; else F are forms, and G is 1.
     """
 
     def __init__(self, grammar: Forms, tried: Sequence[Form], scan: Scan, *, apart: bool) -> None:
         self.scanned = np.array([form.scanned for form in tried])
-        factors, modulators = FormColumns(grammar), FormColumns(grammar)
+        kinds: tuple[KnownColumns, KnownColumns] = {}, {}
+
+        def place(known: KnownColumns, parts: Sequence[tuple[Factor, tuple[str, ...]]], axis: int) -> int:
+            """Return the place of a product of sums of some columns of factors."""
+            key = tuple(texts for _, texts in parts), axis if any(factor.signal == "u" for factor, _ in parts) else 0
+            if key not in known:
+                sums = (sum(grammar.on_axis(text, factor, axis) for text in texts) for factor, texts in parts)
+                known[key] = len(known), reduce(np.multiply, sums, np.ones(len(scan.weight)))
+            return known[key][0]
 
         def places(form: Form, axis: int) -> list[tuple[int, int]]:
             """Return the places of a form's columns, and of the sums of two."""
             texts, modulator = form.factor.texts, [(form.modulator, form.modulator.texts)] if form.modulator else []
-            own = [*((text,) for text in texts), *combinations(texts, 2)]
-            if apart:
-                return [(factors.place([(form.factor, t)], axis), modulators.place(modulator, axis)) for t in own]
-            return [(factors.place([(form.factor, t), *modulator], axis), modulators.place([], axis)) for t in own]
+            own = [[(form.factor, each)] for each in (*((text,) for text in texts), *combinations(texts, 2))]
+            pairs = [(each, modulator) if apart else ([*each, *modulator], []) for each in own]
+            return [(place(kinds[0], f, axis), place(kinds[1], g, axis)) for f, g in pairs]
 
         alike: dict[tuple[int, int], list[int]] = {}  # forms whose columns have the same shape
         for k, form in enumerate(tried):
@@ -135,7 +119,8 @@ class FormProducts:
             (r, members, np.array([[places(tried[k], axis) for k in members] for axis in range(axes)]))
             for (r, axes), members in alike.items()
         ]
-        self.factors, self.modulators = F, G = factors.stacked(), modulators.stacked()
+        F, G = (np.stack([column for _, column in known.values()], axis=1) for known in kinds)
+        self.factors, self.modulators = F, G
         weighted, edges = scan.weight[:, None] * G, [*scan.blocks.first.tolist(), len(F)]
         sums = np.stack([F[at].T @ weighted[at] for at in starmap(slice, pairwise(edges))])
         self.means = means = sums.reshape(len(sums), -1) / scan.blocks.weight[:, None]
@@ -179,10 +164,25 @@ class Forms:
         self._kept: list[FormProducts] | None = None  # of the coarse scan
         self.explain(())
 
+    def at(self, selection: Selection) -> Forms:
+        """Return the forms for another fit of the same observations; they stay the same if the motion does."""
+        timed = [[t.key for t in each.fit.terms if t.effect.moves] for each in (self.selection, selection)]
+        if timed[0] != timed[1]:
+            return Forms(selection)
+        found = copy(self)
+        found.selection, found._kept = selection, None  # noqa: SLF001
+        found.explain(())
+        return found
+
     def explain(self, formulas: Sequence[str]) -> None:
         """Project formulas out of the residual and of all forms from now on."""
         self.explained = forms.columns_of(formulas, self.sensor) if formulas else None
         self.scan = Scan(self.selection, self.explained)
+
+    def on_axis(self, text: str, factor: Factor, axis: int) -> Values:
+        """Return the values of a factor's formula on an axis: (n,) array."""
+        column = self.column(text, factor)
+        return column[:, axis % column.shape[1]]
 
     def column(self, text: str, factor: Factor | None = None) -> Values:
         """Return a formula's values: (n, 1) array, or (n, 3) if the formula contains ``u``.
@@ -192,7 +192,7 @@ class Forms:
         if text not in self._columns:
             of_signal = factor.values(self.column(factor.signal)) if factor and factor.constants else None
             if of_signal is None:
-                of_signal = self.scan.values(forms.columns_of([text], self.sensor), of_samples=True)[:, :, 0]
+                of_signal = self.scan.values(forms.columns_of([text], self.sensor))[:, :, 0]
             self._columns[text] = of_signal
         return self._columns[text]
 
@@ -249,19 +249,16 @@ class Forms:
         declared = [getattr(e, "declared", None) for e in catalogue().values() if self.sensor in e.sensors]
         terms = [term for each in declared if each for term in each.terms.values()]
         known = [term.formulas[""].text for term in terms if "" in term.formulas and not term.shared]
-        seen = {digest for text in known for digest in _digests([self.column(text)[rows]])}
+        seen = {_digest(self.column(text)[rows]) for text in known}
         each = {factor.texts: factor for factor in (*factors, *modulators) if factor}
         probed = {
             texts: np.stack([self.column(text, factor)[rows] for text in texts], axis=-1)
             for texts, factor in each.items()
         }
-        pairs.sort(key=lambda form: form.complexity)
-        values = [
-            probed[form.factor.texts] * probed[form.modulator.texts] if form.modulator else probed[form.factor.texts]
-            for form in pairs
-        ]
         distinct = []
-        for form, digest in zip(pairs, _digests(values), strict=True):
+        for form in sorted(pairs, key=lambda form: form.complexity):
+            values = probed[form.factor.texts]
+            digest = _digest(values * probed[form.modulator.texts] if form.modulator else values)
             if digest not in seen:
                 seen.add(digest)
                 distinct.append(form)
@@ -274,7 +271,7 @@ class Forms:
         u = Span.of(self.selection.observations, "fz" if self.sensor == "accelerometer" else "wz")
         texts = [(signal, forms.powers(span, signal)) for signal, span in [*spans, ("u", u)]]
         curves = forms.columns_of([text for _, each in texts for text in each], self.sensor)
-        return texts, self.scan.values(curves, of_samples=True)
+        return texts, self.scan.values(curves)
 
     def _polynomials(self) -> list[ScoredForm]:
         """Return the polynomial of the best order of each signal, without powers that base or effects contain."""
@@ -293,21 +290,11 @@ class Forms:
         return found
 
 
-def _digests(values: Sequence[Values]) -> list[bytes]:
-    """Return the same bytes for arrays of values that differ by a factor alone."""
-    by_size: dict[int, list[int]] = {}
-    for k, each in enumerate(values):
-        by_size.setdefault(each.size, []).append(k)
-    found = [b""] * len(values)
-    for members in by_size.values():
-        flat = np.stack([values[k].ravel() for k in members])
-        size = np.linalg.norm(flat, axis=1)
-        first = np.take_along_axis(flat, np.argmax(np.abs(flat) > 1e-6 * size[:, None], axis=1)[:, None], axis=1)[:, 0]
-        scale = size * np.sign(first)
-        rounded = np.round(flat / np.where(scale == 0.0, 1.0, scale)[:, None], 9)
-        for k, row in zip(members, rounded, strict=True):
-            found[k] = row.tobytes()
-    return found
+def _digest(values: Values) -> bytes:
+    """Return the same bytes for forms whose values differ by a factor alone."""
+    flat, size = values.ravel(), float(np.linalg.norm(values))
+    first = float(flat[np.argmax(np.abs(flat) > 1e-6 * size)]) if size > 0.0 else 1.0
+    return np.round(flat / (size * np.sign(first) or 1.0), 9).tobytes()
 
 
 def _best_of_each(scored: Iterable[ScoredForm]) -> list[ScoredForm]:
@@ -320,10 +307,9 @@ def _best_of_each(scored: Iterable[ScoredForm]) -> list[ScoredForm]:
     return sorted(best.values(), key=lambda each: -each.score)
 
 
-def search(selection: Selection) -> tuple[list[ScoredForm], list[ScoredForm]]:
+def search(grammar: Forms) -> tuple[list[ScoredForm], list[ScoredForm]]:
     """Return the terms of the best form, none if none is clear, and all forms of one term, best first."""
     terms: list[ScoredForm] = []
-    grammar = Forms(selection)
     first = ranked = grammar.ranked()
     while (
         ranked
@@ -369,9 +355,10 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
     noise = case.noise
     floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
     best, least = Discovery(selection, selection, unknown), _criterion(selection, []) + MIN_DELTA_BIC
-    alone = replace(selection, steps={}, fit=selection.base)
+    alone, grammar = replace(selection, steps={}, fit=selection.base), None
     for context in [selection, alone] if selection.names else [selection]:
-        terms, ranked = search(context)
+        grammar = grammar.at(context) if grammar else Forms(context)
+        terms, ranked = search(grammar)
         if not terms:
             continue
         found, first = _fitted_form(context, terms), terms[0]
@@ -390,7 +377,7 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
             forget(form.name)
         criterion = _criterion(reselected, terms)
         if criterion > least:
-            least, front = criterion, _front(context, terms, ranked)
+            least, front = criterion, _front(grammar, terms, ranked)
             best = Discovery(context, reselected, [entry, *unknown], definition, front)
     fitted = best.unknown[0].form if best.unknown else None
     return replace(best, unknown=_explained(best, fitted)) if fitted else best
@@ -468,10 +455,10 @@ def _explained(found: Discovery, form: FittedForm) -> list[Dependence]:
     return [first, *(e if e.covariate in remaining else replace(e, explained_by=first.covariate) for e in others)]
 
 
-def _front(selection: Selection, terms: Sequence[ScoredForm], ranked: Sequence[ScoredForm]) -> list[RankedFormula]:
+def _front(grammar: Forms, terms: Sequence[ScoredForm], ranked: Sequence[ScoredForm]) -> list[RankedFormula]:
     """Return the forms of one term that gain more than all simpler ones, and before them the suggested one."""
     finalists = list(ranked[:FINALISTS])
-    stable = _stability(selection, finalists)
+    stable = _stability(grammar, finalists)
     shown: list[ScoredForm] = []
     for each in sorted(ranked, key=lambda each: (each.form.complexity + each.form.scanned, -each.gain.delta_bic)):
         if not shown or each.gain.delta_bic > shown[-1].gain.delta_bic:
@@ -492,14 +479,15 @@ def _front(selection: Selection, terms: Sequence[ScoredForm], ranked: Sequence[S
     ]
 
 
-def _stability(selection: Selection, finalists: Sequence[ScoredForm]) -> list[float]:
+def _stability(grammar: Forms, finalists: Sequence[ScoredForm]) -> list[float]:
     """Return the share of the resamples with a clear score in which each form has the best score."""
-    observations, lengths = selection.observations, [len(part.weight) for part in selection.observations.parts]
+    observations = grammar.selection.observations
+    lengths = [len(part.weight) for part in observations.parts]
     folds = ([np.arange(n) * RECORDING_FOLDS // n == fold for n in lengths] for fold in range(RECORDING_FOLDS))
     resamples = chain(without_each_recording(observations), (without_rows(observations, rows) for rows in folds))
-    wins, counted, grammar = np.zeros(len(finalists)), 0, Forms(selection)
+    wins, counted = np.zeros(len(finalists)), 0
     for resample in resamples:
-        gains = grammar.gains([each.form for each in finalists], Scan(selection, rows=resample))
+        gains = grammar.gains([each.form for each in finalists], Scan(grammar.selection, rows=resample))
         scores = [ScoredForm(each.form, gain).score for each, gain in zip(finalists, gains, strict=True)]
         if max(scores) > MIN_DELTA_BIC:
             wins[int(np.argmax(scores))] += 1

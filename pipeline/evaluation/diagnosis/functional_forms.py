@@ -44,6 +44,8 @@ from pipeline.physics.formula import parse
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
+    from numpy.typing import ArrayLike
+
     from pipeline.core.records import Index, Mask, Motion, Values
     from pipeline.estimation.observations import Observations
     from pipeline.estimation.selection import Selection
@@ -368,10 +370,7 @@ class Whitened(NamedTuple):
 
     def grams(self, r: int) -> Values:
         """Return the products of the columns of each of m forms of r columns: (t, m, r, r) array."""
-        forms = len(self.means[0]) // r
-        if forms == 1:
-            return self.times(self)[:, None]
-        found = np.empty((len(self.means), forms, r, r))
+        found = np.empty((len(self.means), len(self.means[0]) // r, r, r))
         for i, j in product(range(r), repeat=2):
             found[..., i, j] = np.einsum("tqm,tqm->tq", self.means[:, i::r], self.means[:, j::r])
             found[..., i, j] += np.einsum("nq,nq->q", self.inside[:, i::r], self.inside[:, j::r])
@@ -389,8 +388,8 @@ class Scan:
         observations = (rows or selection.observations).less_stop_errors
         self.samples = 3.0 * observations.samples
         self.within = float(np.sum(observations.scatter / self.scale**2))
-        self._motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]
-        self._joined = [motion for motion, _ in joined_motions(self._motions)]
+        motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]
+        self._motions = [motion for motion, _ in joined_motions(motions)]
         self.blocks, self.weight = observations.blocks, observations.weight
         self._label = self.blocks.label(len(self.weight))
         self.noise = GaussMarkov(self.blocks, [WHITE_SETTING, *selection.settings])
@@ -421,12 +420,12 @@ class Scan:
         self.left: Values = np.stack(left, axis=1)
         self.before = float(self.log_likelihood(self.left.sum(axis=1)).max())
 
-    def values(self, curves: Curves, *, of_samples: bool = False) -> Values:
+    def values(self, curves: Curves) -> Values:
         """Return the values of curves in all rows: (n, 3, q) array, or (n, 1, q) if they are equal on all axes.
 
-        ``of_samples``: the values at a sample depend on the motion there alone.
+        They depend at a sample on the motion there alone.
         """
-        return np.concatenate([curves(motion) for motion in (self._joined if of_samples else self._motions)])
+        return np.concatenate([curves(motion) for motion in self._motions])
 
     def whitened(self, columns: Values) -> Whitened:
         """Return (n, q) columns whitened."""
@@ -496,17 +495,13 @@ class Scan:
         return self.drops_of(grams, [version.times(self.every) for version in versions])
 
     def drops_of(self, grams: Sequence[Values], across: Sequence[Values]) -> Values:
-        """Return ``drops`` from products of columns; see ``_without_model``."""
-        inner, cross, error = self._without_model(grams, across)
+        """Return ``drops`` from products of columns; see ``left_of``."""
+        inner, cross, error = self.left_of(grams, across)
         explained, new = each_explains(inner, cross[..., None], error)
         new &= new[0]
         return np.asarray(np.where(new.all(axis=3), explained[..., 0].sum(axis=3), 0.0)[1:])
 
-    def products(self, versions: Sequence[Whitened], r: int) -> tuple[Values, Values, Values]:
-        """Return ``_without_model`` of m forms of r columns; ``versions``: the columns of each axis, or one for all."""
-        return self._without_model([each.grams(r) for each in versions], [v.times(self.every) for v in versions])
-
-    def _without_model(self, grams: Sequence[Values], across: Sequence[Values]) -> tuple[Values, Values, Values]:
+    def left_of(self, grams: Sequence[Values], across: Sequence[Values]) -> tuple[Values, Values, Values]:
         """Return products of m forms of r columns without their part in the model, white noise first.
 
         ``grams``: (t, m, r, r), products of the columns of each form, for each axis, or once for all. ``across``: (t,
@@ -541,7 +536,9 @@ class ProjectedCurves:
 
     def __init__(self, scan: Scan, values: Values) -> None:
         self.columns = [scan.whitened(values[:, k]) for k in range(values.shape[1])]
-        inner, cross, error = (each[:, :, 0] for each in scan.products(self.columns, values.shape[2]))
+        grams = [each.times(each)[:, None] for each in self.columns]
+        found = scan.left_of(grams, [each.times(scan.every) for each in self.columns])
+        inner, cross, error = (each[:, :, 0] for each in found)
         self.inner, self.cross, self.error = inner[1:], cross[1:], error[1:]
         first = self.columns[0]
         self.size = np.sqrt(np.sum(first.means[0] ** 2, axis=1) + np.sum(first.inside**2, axis=0))
@@ -556,13 +553,16 @@ class ProjectedCurves:
                 rest -= np.outer(rest[:, j], rest[j]) / rest[j, j]
         return new
 
-    def drop(self, index: Sequence[int]) -> Values:
-        """Return the drops of the first curve, the first two curves and so on: (t, 3, r) array."""
-        return np.asarray(np.cumsum(self._each(index)[0], axis=2))
+    def drop(self, index: ArrayLike) -> Values:
+        """Return the drops of the first curve, the first two curves and so on: (t, 3, ..., r) array.
 
-    def _each(self, index: Sequence[int]) -> tuple[Values, Mask]:
-        """Return the drop by each curve after those before it, and whether it is independent of them: (t, 3, r)."""
-        inner, cross = self.inner[:, :, index][:, :, :, index], self.cross[:, :, index]
+        ``index``: (..., r), of several sets of curves.
+        """
+        return np.asarray(np.cumsum(self._each(np.asarray(index))[0], axis=-1))
+
+    def _each(self, index: Index) -> tuple[Values, Mask]:
+        """Return the drop by each curve after those before it, and whether it is independent of them: (t, 3, .., r)."""
+        inner, cross = self.inner[:, :, index[..., :, None], index[..., None, :]], self.cross[:, :, index]
         explained, independent = each_explains(inner, cross[..., None], self.error[:, :, index])
         return explained[..., 0], independent
 
@@ -572,7 +572,7 @@ class ProjectedCurves:
         The coefficient of a curve that depends on those before it is 0.
         """
         inner, cross = self.inner[setting][:, index][:, :, index], self.cross[setting][:, index]
-        independent = self._each(index)[1][setting]
+        independent = self._each(np.asarray(index))[1][setting]
         both = np.einsum("cr,cs->crs", independent, independent)
         known = np.where(both, inner, np.eye(len(index)))
         found: Values = np.linalg.solve(known, (cross * independent)[..., None])[..., 0]

@@ -146,15 +146,16 @@ def _significant(selection: Selection, explained: Curves | None) -> dict[str, tu
 
 def _tests_of_curves(bases: Sequence[Basis], scan: Scan) -> Tests:
     projected = ProjectedCurves(scan, scan.values(_curves_of(bases)))
-    names: list[str] = []
-    counts: list[int] = []
-    drops = [np.zeros((*scan.left.shape, 0))]
-    for covariate, independent, least in _independent(bases, projected):
-        drops.append(projected.drop(independent)[:, :, least - 1 :])
-        counts += range(least, len(independent) + 1)
-        names += [covariate] * (len(independent) + 1 - least)
-    parameters = 3 * np.array(counts, int)
-    return names, scan.gains(np.concatenate(drops, axis=2), parameters), parameters
+    tests = [*_independent(bases, projected)]
+    drops = [np.zeros((*scan.left.shape, 0))] * len(tests)
+    for size in {len(index) for _, index, _ in tests}:
+        of_size = [k for k, (_, index, _) in enumerate(tests) if len(index) == size]
+        together = projected.drop([tests[k][1] for k in of_size])
+        for k, each in zip(of_size, np.moveaxis(together, 2, 0), strict=True):
+            drops[k] = each[:, :, tests[k][2] - 1 :]
+    names = [covariate for covariate, index, least in tests for _ in range(least, len(index) + 1)]
+    parameters = 3 * np.array([count for _, index, least in tests for count in range(least, len(index) + 1)], int)
+    return names, scan.gains(np.concatenate([np.zeros((*scan.left.shape, 0)), *drops], axis=2), parameters), parameters
 
 
 def _tests_of_steps(selection: Selection, covariates: Sequence[str], scan: Scan) -> Tests:
