@@ -27,7 +27,7 @@ KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
-TEXTS = (".csv", ".txt", ".tsv", ".dat")
+TEXTS = (".csv", ".txt", ".tsv", ".dat", ".log")
 LARGEST_MEMBER = 1 << 32  # bytes
 PRINTABLE = 64  # first bytes of a text
 BINARY = "a binary file of a kind that is not known: export it as text by the program that wrote it"

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import imu_logs
+from imu_logs.files import is_message_log
 from imu_logs.profile import TIME, checks_of, csv_formats
 from imu_logs.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError, MissingInputError
@@ -283,8 +284,8 @@ def _compare_clocks(recordings: list[Recording]) -> list[Recording]:
 
 def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, checks: Checks) -> Log:
     """Read the channels of a file of attitudes; raises ``IngestError`` for a log that is no text."""
-    if path.suffix.lower() != ".csv" or len(layouts) != 1:
-        raise IngestError("attitudes are read from one .csv; export them as text", str(path), code="foreign")
+    if is_message_log(path) or len(layouts) != 1:
+        raise IngestError("attitudes are read from one text log; export them as text", str(path), code="foreign")
     columns = tuple(c for c in layouts[0].columns if c.channel != TIME)
     from imu_logs.text_read import read_csv  # noqa: PLC0415  (pyarrow, for tables of means)
 

@@ -109,3 +109,30 @@ def test_what_is_said_not_to_have_moved_is_proposed_as_a_rest(tmp_path: Path) ->
     unit.write("still", "rest,,,,", *at_rest(4.0, UP))  # the edges of a rest, 0.5 s, are left out of it
     settings = Composer(tmp_path).unit("unit", ["sensor=mpu6050", "procedure=listed"])
     assert proposed_sheet(tmp_path, settings).splitlines()[1:] == ["still.csv,rest"]
+
+
+# Temperature in degC and the accelerometer's z in m/s^2 of the unit chamber of data/published, cooled and heated.
+CHAMBER = """
+51.6 -9.686 31.3 -9.739 18.9 -9.697 10.0 -9.618 2.2 -9.486 -4.8 -9.343 -10.2 -9.202 -14.6 -9.138 -17.6 -9.038
+-12.3 -9.157 -4.5 -9.302 4.2 -9.451 13.5 -9.534 22.9 -9.580 42.8 -9.583 62.6 -9.514 72.4 -9.455"""
+
+
+def test_a_sweep_of_temperature_that_moves_the_readings_is_proposed_as_a_soak(tmp_path: Path) -> None:
+    unit = Unit(tmp_path, np.random.default_rng(3))
+    warmth, z = np.array(CHAMBER.split(), float).reshape(-1, 2).T
+    warmth, z = (np.interp(np.arange(6000), np.linspace(0, 6000, len(v)), v) for v in (warmth, z / 9.80665))
+    rate = np.outer(warmth, [1e-4, 3e-4, 5e-5])
+    unit.write("chamber", "soak,,,,", np.outer(z, [0.01, -0.01, 1.0]), rate, warmth=warmth, hz=2.0)
+    settings = Composer(tmp_path).unit("unit", ["sensor=mpu6050", "procedure=listed"])
+    assert proposed_sheet(tmp_path, settings).splitlines()[1:] == ["chamber.csv,soak"]
+
+
+def test_means_are_proposed_as_attitudes_by_a_profile_that_counts_rows(tmp_path: Path) -> None:
+    up = np.random.default_rng(3).normal(size=(24, 3))
+    np.savetxt(tmp_path / "means.log", up / np.linalg.norm(up, axis=1, keepdims=True), delimiter=",")
+    columns = ", ".join(f"accel_{axis}: {{column: {k}, unit: g}}" for k, axis in enumerate("xyz"))
+    (tmp_path / "configs" / "ingest").mkdir(parents=True)
+    profile = f"name: means\ncsv:\n  header: false\n  rate_hz: 1\n  columns: {{{columns}}}\nmcap: {{}}\n"
+    (tmp_path / "configs" / "ingest" / "means.yaml").write_text(profile)
+    settings = Composer(tmp_path).unit("unit", ["sensor=generic", "procedure=listed", "ingest=means"])
+    assert proposed_sheet(tmp_path, settings).splitlines()[1:] == ["means.log,attitudes"]

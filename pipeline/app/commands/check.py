@@ -397,6 +397,8 @@ def _sheet_proposed(campaign: Campaign, unit: str, saved: SavedProfiles) -> list
     proposed = texts[-1] if used else texts[0]
     if not proposed:
         return []
+    if not has_rows(proposed):
+        proposed += f"\n# a profile: python -m pipeline check FILE --save {campaign.directory}/configs/ingest/NAME.yaml"
     head = f"PROPOSED {folder / config.procedure.sheet}, by what the files show{used}; correct it:"
     return [f"{_wrapped(head)}\n\n{proposed}"]
 

@@ -4,7 +4,7 @@ Propose the sheet ``recordings.csv`` for the files of a unit, from what their re
 
 | readings | kind |
 |---|---|
-| no time column | ``attitudes`` |
+| no time column, or of an accelerometer alone, 5 deg and more from row to row | ``attitudes`` |
 | a table's angle or rate that changes with the rate about one axis | ``table`` |
 | at rest in one attitude; the temperature changes by 10 degC or more | ``soak``, else ``rest`` |
 | a rotation by 45 deg or more about one axis | ``turn``: whole turns where they fit, else the angle to 1 deg |
@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from imu_logs.files import MESSAGE_FORMATS, SUFFIXES, kind_of
+from imu_logs.files import MESSAGE_FORMATS, SUFFIXES, TEXTS, kind_of
 from imu_logs.guesses import BURST_INTERVAL_DIFFERENCE
 from imu_logs.mcap_file import McapReader
 from imu_logs.message_decoder import ARRAYS, KINDS, object_decoder, ros_layouts
@@ -80,13 +80,14 @@ WHOLE_REST = 0.9  # share of a recording that is one rest, where the sensor did 
 SUITS_FERRARIS = "six faces and turns about x, y and z in one file: procedure=ferraris determines more (docs/record.md)"
 SAME_ATTITUDE_DEG = 5.0
 SWEPT_DEGC = 10.0  # as of a sweep that validation shows
+QUIET_DPS = 5.0  # range of a gyroscope at rest, of which bias over temperature is a part
+SOAKED_PARTS = 20  # whose mean directions are compared
 MIN_PROPOSED_TURN_DEG = 45.0
 WHOLE, ROUND_DEG = 0.05, 1.0  # relative: a scale factor error of 3 %, and a hand; of an angle that is proposed
 SMOOTHED_S = 0.2
 CLEARER = 0.25  # of the sum of squares, below which another map of axes is proposed
 NO_RATE = np.zeros(3)
 GRAVITY_WITHIN = 0.2  # g, at rest: consumer sensors have biases of 0.1 g; another unit is wrong by more
-TEXT_SUFFIX = ".txt"  # a text log, where the profile describes it
 OF_PARTS = "log"  # in a sheet, the name of the only recording, where the parts of the profile have fixed names
 
 
@@ -100,10 +101,8 @@ def facts(recording: Recording, sensor: Sensor | None = None) -> list[Line]:
     if recording.temperature is not None:
         low, high = float(recording.temperature.min()), float(recording.temperature.max())
         lines.append(("temperature", f"{low:.4g} to {high:.4g} degC" if high > low else f"{low:.4g} degC throughout"))
-    lines += _table(recording)
-    lines.append(("rests", _describe_rests(recording, rests)))
-    lines.append(("clipping", _clipping(recording, sensor)))
-    lines += _units(recording, rests)
+    lines += [*_table(recording), ("rests", _describe_rests(recording, rests))]
+    lines += [("clipping", _clipping(recording, sensor)), *_units(recording, rests)]
     lines += [("notes" if i == 0 else "", text) for i, text in enumerate(_notes(recording.notes))]
     return lines
 
@@ -117,16 +116,11 @@ def shows_gravity(recording: Recording) -> bool:
 
 def as_text(lines: Sequence[Line]) -> str:
     """Return pairs of label and text as wrapped lines in two columns."""
-    wrapped = []
+    wrapped, rest = [], " " * (2 + LABEL_WIDTH)
     for label, text in lines:
         first = f"  {label:<{LABEL_WIDTH}}"
         wrapped += textwrap.wrap(
-            text,
-            WIDTH,
-            initial_indent=first,
-            subsequent_indent=" " * len(first),
-            break_long_words=False,
-            break_on_hyphens=False,
+            text, WIDTH, initial_indent=first, subsequent_indent=rest, break_long_words=False, break_on_hyphens=False
         )
     return "\n".join(wrapped)
 
@@ -139,8 +133,7 @@ def _time(recording: Recording) -> str:
     rate, median = f"{1 / interval:.6g} Hz", f"{_number(interval * 1e3)} ms"
     bursty = abs(mean / interval - 1.0) > BURST_INTERVAL_DIFFERENCE
     rate = f"{1 / mean:.6g} Hz on average ({rate} by the median interval of " if bursty else f"{rate} (median interval "
-    rate += median
-    text = f"{recording.samples:,} rows over {_number(span)} s at {rate}), from {_number(float(time[0]) / 1e9)} s"
+    text = f"{recording.samples:,} rows over {_number(span)} s at {rate}{median}), from {_number(time[0] / 1e9)} s"
     gaps = 0 if recording.flags is None else int(np.count_nonzero(recording.flags & GAP))
     if gaps:
         return f"{text}; {gaps} gap{'s'[: gaps > 1]} (see the notes)"
@@ -200,8 +193,7 @@ def _table(recording: Recording) -> list[Line]:
         texts.append(text if np.any(rate) else "rate 0 deg/s")
     if recording.table_attitude is not None:
         texts.append("attitude")
-    clock = recording.source.get("table_clock")
-    if clock:
+    if clock := recording.source.get("table_clock"):
         texts.append(f"a separate clock, {clock['offset_s']:.6g} s ahead and gaining {clock['drift_ppm']:.3g} ppm")
     if texts and recording.table_attitude is None and not _turns(recording):
         texts.append("it does not change: the table did not turn, or its encoder is not connected")
@@ -271,8 +263,7 @@ def _clipping(recording: Recording, sensor: Sensor | None) -> str:
             continue
         for channel, values in zip(TRIADS[name], readings.T, strict=True):
             texts += [f"{channel} stays at {text}: clipped?" for text in _plateaus(values)]
-    clipped = 0 if flags is None else int(np.count_nonzero(flags & CLIPPED))
-    stuck = 0 if flags is None else int(np.count_nonzero(flags & STUCK))
+    clipped, stuck = (0 if flags is None else int(np.count_nonzero(flags & flag)) for flag in (CLIPPED, STUCK))
     if all(full_scale.values()):
         texts.append(f"{clipped} rows at full scale" if clipped else "none at full scale")
     elif not texts:
@@ -317,8 +308,7 @@ def _rates_and_gravity(moves: Sequence[MoveByHand]) -> str:
     best = int(np.argmin(others))
     angle, way = np.median([(m.angle_deg, m.way) for m in moves], axis=0)
     over = f"{counted(len(moves), 'move')} that turn{'s' * (len(moves) == 1)} it by {angle:.0f} deg (medians)"
-    axes = other_axes(moves)
-    if axes is not None:
+    if (axes := other_axes(moves)) is not None:
         return f"accelerometer and gyroscope contradict each other: {axes[0]}: check the order and signs of the axes"
     if declared <= FAILS_DEG and DECISIVE_RATIO * declared <= others[best]:
         return (
@@ -449,8 +439,7 @@ def proposed_sheet(folder: Path, settings: Settings) -> str:
     bias = median(np.array([np.asarray(r.gyroscope).mean(axis=0) for r in still])) if still else NO_RATE
     rows += [_of_table(recording, bias, settings.table.sense) or _row(recording, bias) for recording in found]
     remarks += [f"# {r.name}: {SUITS_FERRARIS}" for r in found if suits_ferraris(r)]
-    wrong = _other_axes(found, bias)
-    if wrong:
+    if wrong := _other_axes(found, bias):
         remarks.append(
             f"# gravity and turns agree with sensor.gyroscope.axis_map=[{', '.join(wrong)}], not the given one"
         )
@@ -468,7 +457,7 @@ def _logs_in(folder: Path, ingest: Ingest, sheet: str) -> dict[str, list[Path]]:
     patterns = [re.compile(re.escape(p["file"]).replace(re.escape(FILE), ".+")) for p in parts_of(ingest)]
     files = [f for f in sorted(folder.glob("*")) if f.is_file() and f.name != sheet]
     parts = [f for f in files if any(pattern.fullmatch(f.name) for pattern in patterns)]
-    logs = {f.name: [f] for f in files if f.suffix in (*SUFFIXES, TEXT_SUFFIX) and f not in parts}
+    logs = {f.name: [f] for f in files if f.suffix.lower() in (*SUFFIXES, *TEXTS) and f not in parts}
     for group in grouped(parts, ingest):
         fixed = parts_of(ingest)[0]["file"]
         logs[group[0].name.removesuffix(fixed.replace(FILE, "")) or OF_PARTS] = group
@@ -481,16 +470,23 @@ def _accepted(recording: Recording) -> list[Rest]:
 
 def _is_still(recording: Recording) -> bool:
     """Return whether a recording is at rest in one attitude."""
-    if recording.accelerometer is None:
-        rate = np.asarray(recording.gyroscope)
-        total = np.trapezoid(rate - median(rate), recording.time, axis=0)
-        return bool(np.ptp(rate, axis=0).max() < 5.0 and np.abs(total).max() < SAME_ATTITUDE_DEG)
-    rests = _accepted(recording)
+    force, rate = recording.accelerometer, recording.gyroscope
+    quiet = rate is not None and float(np.ptp(rate, axis=0).max()) < QUIET_DPS
+    if force is None:
+        total = np.trapezoid(np.asarray(rate) - median(np.asarray(rate)), recording.time, axis=0)
+        return quiet and (_is_swept(recording) or bool(np.abs(total).max() < SAME_ATTITUDE_DEG))
     if _did_not_move(recording, _rests(recording)):
         return True
-    u = [recording.accelerometer[r.start : r.stop].mean(axis=0) for r in rests]
-    apart = [np.degrees(np.linalg.norm(v / np.linalg.norm(v) - u[0] / np.linalg.norm(u[0]))) for v in u]
-    return sum(r.stop - r.start for r in rests) > RESTING_SHARE * recording.samples and max(apart) < SAME_ATTITUDE_DEG
+    drifts = quiet and _is_swept(recording)  # temperature moves the readings by more than a rest allows
+    parts = np.array_split(force, SOAKED_PARTS) if drifts else [force[r.start : r.stop] for r in _accepted(recording)]
+    u = [part.mean(axis=0) / np.linalg.norm(part.mean(axis=0)) for part in parts]
+    apart = [np.degrees(np.linalg.norm(v - u[0])) for v in u]
+    return sum(map(len, parts)) > RESTING_SHARE * recording.samples and max(apart) < SAME_ATTITUDE_DEG
+
+
+def _is_swept(recording: Recording) -> bool:
+    warm = recording.temperature
+    return warm is not None and float(np.ptp(warm[np.isfinite(warm)])) >= SWEPT_DEGC
 
 
 def _of_table(recording: Recording, bias: Values, sense: float) -> str:
@@ -508,10 +504,13 @@ def _of_table(recording: Recording, bias: Values, sense: float) -> str:
 def _row(recording: Recording, bias: Values) -> str:
     """Return the row of a recording; ``bias``: of the gyroscope at rest in other recordings."""
     if _is_still(recording):
-        warm = recording.temperature
-        swept = warm is not None and float(np.ptp(warm[np.isfinite(warm)])) >= SWEPT_DEGC
-        return f"{recording.name},{'soak' if swept else 'rest'}"
-    rests, rate = [] if recording.accelerometer is None else _accepted(recording), recording.gyroscope
+        return f"{recording.name},{'soak' if _is_swept(recording) else 'rest'}"
+    force, rate = recording.accelerometer, recording.gyroscope
+    if rate is None and force is not None:
+        u = force / np.linalg.norm(force, axis=1, keepdims=True)
+        if np.degrees(np.median(np.linalg.norm(np.diff(u, axis=0), axis=1))) > SAME_ATTITUDE_DEG:
+            return f"{recording.name},attitudes"
+    rests = [] if force is None else _accepted(recording)
     if rate is not None:
         own = np.mean([rate[r.start : r.stop].mean(axis=0) for r in rests], axis=0) if rests else bias
         angle = np.asarray(np.trapezoid(rate - own, recording.time, axis=0), np.float64)
@@ -548,7 +547,5 @@ def _other_axes(recordings: Sequence[Recording], bias: Values) -> list[str]:
     (order, signs), least = min(costs.items(), key=lambda item: item[1])
     if least > CLEARER * costs[(0, 1, 2), (1.0, 1.0, 1.0)]:
         return []
-    body = {
-        axis: f"{'+' if sign > 0.0 else '-'}{AXES[k]}" for k, (axis, sign) in enumerate(zip(order, signs, strict=True))
-    }
-    return [body[axis] for axis in range(3)]
+    body = sorted(zip(order, signs, AXES, strict=True))
+    return [f"{'+' if sign > 0.0 else '-'}{name}" for _, sign, name in body]
