@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from pipeline.core.records import Values
+    from pipeline.estimation.design import Design
+    from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.observations import Observations
     from pipeline.evaluation.diagnosis.findings import DiagnosisInput
     from pipeline.evaluation.diagnosis.functional_forms import Factor
@@ -94,6 +96,8 @@ class FormProducts:
     """
 
     def __init__(self, grammar: Forms, tried: Sequence[Form], scan: Scan, *, apart: bool) -> None:
+        self._squares: dict[tuple[Setting, ...], Values] = {}  # by noise: (t, q, p)
+        self._across: dict[tuple[Design, tuple[Setting, ...]], Values] = {}  # by model and noise, see ``across``
         self.scanned = np.array([form.scanned for form in tried])
         kinds: tuple[KnownColumns, KnownColumns] = {}, {}
 
@@ -123,20 +127,27 @@ class FormProducts:
         self.factors, self.modulators = F, G
         weighted, edges = scan.weight[:, None] * G, [*scan.blocks.first.tolist(), len(F)]
         sums = np.stack([F[at].T @ weighted[at] for at in starmap(slice, pairwise(edges))])
-        self.means = means = sums.reshape(len(sums), -1) / scan.blocks.weight[:, None]
-        inside = (F**2).T @ (weighted * G) - (scan.blocks.weight @ means**2).reshape(F.shape[1], -1)
-        parts = [scan.noise.whitened(part) for part in np.array_split(means, means.shape[1] // CACHED + 1, axis=1)]
-        own = np.concatenate([np.einsum("tqm,tqm->tq", part, part) for part in parts], axis=1)
-        self.squares = own.reshape(-1, *inside.shape) + np.maximum(inside, 0.0)
+        self.means = sums.reshape(len(sums), -1) / scan.blocks.weight[:, None]
+        between = (scan.blocks.weight @ self.means**2).reshape(F.shape[1], -1)
+        self.inside = np.maximum((F**2).T @ (weighted * G) - between, 0.0)
+
+    def squares(self, scan: Scan) -> Values:
+        """Return the whitened squares of the products: (t, q, p) array."""
+        if scan.settings not in self._squares:
+            pieces = np.array_split(self.means, self.means.shape[1] // CACHED + 1, axis=1)
+            white = (scan.noise.whitened(piece) for piece in pieces)
+            own = np.concatenate([np.einsum("tqm,tqm->tq", piece, piece) for piece in white], axis=1)
+            self._squares[scan.settings] = own.reshape(-1, *self.inside.shape) + self.inside
+        return self._squares[scan.settings]
 
     def gains(self, scan: Scan) -> list[FormGain]:
         """Return the gain of each form."""
         found: dict[int, FormGain] = {}
-        across = self._across(scan)
+        across, squares = self.across(scan), self.squares(scan)
         for r, members, places in self.alike:
             grams, with_all = [], []
             for f, m in np.moveaxis(places, 3, 1):
-                own, gram = self.squares[:, f, m], np.empty((len(self.squares), len(members), r, r))
+                own, gram = squares[:, f, m], np.empty((len(squares), len(members), r, r))
                 gram[..., range(r), range(r)] = own[..., :r]
                 for k, (i, j) in enumerate(combinations(range(r), 2), r):
                     gram[..., i, j] = gram[..., j, i] = 0.5 * (own[..., k] - own[..., i] - own[..., j])
@@ -146,12 +157,20 @@ class FormProducts:
             found |= dict(zip(members, gains, strict=True))
         return [found[k] for k in range(len(found))]
 
-    def _across(self, scan: Scan) -> Values:
-        """Return the whitened products with the columns of model and readings: (t, q, p, k) array."""
-        columns = np.sqrt(scan.weight)[:, None] * scan.every.inside
-        shape = self.factors.shape[1], self.modulators.shape[1], columns.shape[1]
+    def across(self, scan: Scan) -> Values:
+        """Return the whitened products with the columns of model, readings and curves: (t, q, p, k) array."""
+        key, own = (scan.design, scan.settings), scan.design.columns.columns.shape[1]
+        if key not in self._across:
+            self._across[key] = self._with_columns(scan, slice(own))
+        curves = scan.columns.shape[1] > own  # that the scan projects out too
+        found = [self._across[key], *([self._with_columns(scan, slice(own, None))] if curves else [])]
+        return np.concatenate(found, axis=3)
+
+    def _with_columns(self, scan: Scan, at: slice) -> Values:
+        columns = np.sqrt(scan.weight)[:, None] * scan.every.inside[:, at]
+        shape = *self.inside.shape, columns.shape[1]
         inside = self.factors.T @ (self.modulators[:, :, None] * columns[:, None]).reshape(len(columns), -1)
-        between = self.means.T @ scan.noise.solve(scan.means(scan.columns))
+        between = self.means.T @ scan.noise.solve(scan.means(scan.columns[:, at]))
         return np.asarray(between.reshape(-1, *shape) + inside.reshape(shape))
 
 
@@ -170,7 +189,7 @@ class Forms:
         if timed[0] != timed[1]:
             return Forms(selection)
         found = copy(self)
-        found.selection, found._kept = selection, None  # noqa: SLF001
+        found.selection = selection
         found.explain(())
         return found
 
@@ -265,28 +284,30 @@ class Forms:
         return distinct + [Form(band) for band in (forms.bands(spans["speed"]) if "speed" in spans else [])]
 
     @cached_property
-    def _powers(self) -> tuple[list[tuple[str, tuple[str, ...]]], Values]:
-        """Return signal and formulas of each polynomial, and the values of all formulas."""
+    def _powers(self) -> list[tuple[list[tuple[str, tuple[str, ...]]], Values]]:
+        """Return signal and formulas of each polynomial, and the values of all formulas; those of ``u`` are apart."""
         spans = [(span.signal, span) for span in self._spans.values()]
         u = Span.of(self.selection.observations, "fz" if self.sensor == "accelerometer" else "wz")
-        texts = [(signal, forms.powers(span, signal)) for signal, span in [*spans, ("u", u)]]
-        curves = forms.columns_of([text for _, each in texts for text in each], self.sensor)
-        return texts, self.scan.values(curves)
+        texts = [[(signal, forms.powers(span, signal)) for signal, span in each] for each in (spans, [("u", u)])]
+        formulas = [[text for _, powers in each for text in powers] for each in texts]
+        values = [self.scan.values(forms.columns_of(each, self.sensor)) for each in formulas]
+        return list(zip(texts, values, strict=True))
 
     def _polynomials(self) -> list[ScoredForm]:
         """Return the polynomial of the best order of each signal, without powers that base or effects contain."""
-        signals, values = self._powers
-        projected, found, first = ProjectedCurves(self.scan, values), [], 0
-        for signal, texts in signals:
-            new = projected.independent(range(first, first + len(texts)))
-            drops = projected.drop(new) if new else np.zeros((*self.scan.left.shape, 1))
-            gains = self.scan.best_axes(drops, np.arange(1, drops.shape[2] + 1))
-            best = max(range(len(gains)), key=lambda k: gains[k].delta_bic - PRICE * k)
-            index = [k - first for k in new[: best + 1]]
-            formulas = tuple(texts[k] for k in index)
-            form = forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)
-            found.append(ScoredForm(Form(form), gains[best]))
-            first += len(texts)
+        found = []
+        for signals, values in self._powers:
+            projected, first = ProjectedCurves(self.scan, values), 0
+            for signal, texts in signals:
+                new = projected.independent(range(first, first + len(texts)))
+                drops = projected.drop(new) if new else np.zeros((*self.scan.left.shape, 1))
+                gains = self.scan.best_axes(drops, np.arange(1, drops.shape[2] + 1))
+                best = max(range(len(gains)), key=lambda k: gains[k].delta_bic - PRICE * k)
+                index = [k - first for k in new[: best + 1]]
+                formulas = tuple(texts[k] for k in index)
+                form = forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)
+                found.append(ScoredForm(Form(form), gains[best]))
+                first += len(texts)
         return found
 
 

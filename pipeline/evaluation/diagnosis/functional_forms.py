@@ -392,9 +392,11 @@ class Scan:
         self._motions = [motion for motion, _ in joined_motions(motions)]
         self.blocks, self.weight = observations.blocks, observations.weight
         self._label = self.blocks.label(len(self.weight))
-        self.noise = GaussMarkov(self.blocks, [WHITE_SETTING, *selection.settings])
+        self.settings = WHITE_SETTING, *selection.settings
+        self.noise = GaussMarkov(self.blocks, self.settings)
         self._unit = float(UNIT_ROUNDOFF * np.sqrt(observations.samples)) ** 0.5
-        design = selection.fit.design(selection.observations.less_stop_errors)  # its columns depend on no weight
+        # its columns depend on no weight
+        self.design = design = selection.fit.design(selection.observations.less_stop_errors)
         A, places = design.columns.columns, [design.places(c)[0] for c in range(3)]
         if explained is not None:
             values, first = self.values(explained), A.shape[1]
