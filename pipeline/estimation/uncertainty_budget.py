@@ -106,8 +106,8 @@ ACROSS = (
     "of the turns"
 )
 GRAVITY = "local gravity"
-# Of a fit, by which the change by an open effect is computed: means of 0.12 s of 2.4 million samples at 1 kHz. In 20 min
-# at 1 kHz no figure of ``open`` changes by more than 2e-5 of itself.
+# Of a fit, by which the change by an open effect is computed: means of 0.12 s of 2.4 million samples at 1 kHz. In 20
+# minutes at 1 kHz no figure of ``open`` changes by more than 2e-5 of itself.
 MAX_CHANGED_SAMPLES = 20_000
 
 
