@@ -31,7 +31,7 @@ from pipeline.estimation.gates import min_delta_bic
 from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import JointFit, calibration_of, design_at
 from pipeline.estimation.harm import fits_of, harmful, harmful_in_turns
-from pipeline.estimation.observations import observe, without_each_recording
+from pipeline.estimation.observations import ROLES, observe, without_each_recording
 from pipeline.estimation.posterior import posterior
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
@@ -293,7 +293,13 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
         method_errors=method_errors(case.calibration, reported, case.recordings, case.settings),
         suggested_effect=discovery.suggested,
         table_evidence=TableEvidence(held_out, discovery.front),
-        details={"pictures": plots(selection, unknown, noise, reported)},
+        details={
+            "pictures": plots(selection, unknown, noise, reported),
+            "rows": {
+                "rows": len(observations.weight),
+                "samples": sum(r.samples for r in case.recordings if r.role in ROLES),
+            },
+        },
         turns=turns_of(observations),
         deeper=lambda: {
             "influence": influence(reported, [*suggested, *reported.names]),
