@@ -32,6 +32,7 @@ axis, ``c exp(-x / w)`` or ``c (1 - tanh(x / w))``, x the share of the span from
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import groupby, pairwise, product
@@ -275,6 +276,15 @@ class Design:
         width, count = self._own[0].columns.shape[1], self.count + 1 + self.stops
         self._from = [np.add.outer(at * width, at).ravel() for at in self._at]
         self._to = [np.add.outer(index * count, index).ravel() for index in self._total]
+
+    def reweighted(self, observations: Observations) -> Design:
+        """Return the design of the same rows with other weights."""
+        found, blocks, weight = copy(self), observations.blocks, observations.weight
+        found.columns = Products(blocks, weight, self.columns.columns)
+        found._own = [found.columns] * 3  # noqa: SLF001
+        if self.stops:
+            found._own = [Products(blocks, weight, own.columns) for own in self._own]  # noqa: SLF001
+        return found
 
     def _add_stops(self, observations: Observations, terms: Sequence[EffectColumns], K: Values) -> None:
         """Add the errors of the angle, as parameters after the readings, with separate columns for each axis."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.estimation.generalized_least_squares import design_at, fit_terms
+from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.multi_position.fit import COMPARED_STEP, fit
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.observations import without_rows
@@ -103,7 +103,7 @@ def _harmful_in_turns(selection: Selection, fits: Sequence[JointFit]) -> dict[st
     for each in fits:
         design, errors = each.design(observations), np.zeros(len(weight))
         for k, rest in enumerate(folds):
-            products = design_at(rest, each).products([each.setting])[0]
+            products = design.reweighted(rest).products([each.setting])[0]
             step = projection(products, np.arange(products.shape[1] - 1))[0][:, -1]
             for c in range(3):
                 columns, places = design.of_axis(c), design.places(c)[1]

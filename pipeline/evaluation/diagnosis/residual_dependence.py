@@ -54,6 +54,7 @@ from pipeline.evaluation.diagnosis.functional_forms import (
     ProjectedCurves,
     Scan,
     Span,
+    Whitened,
     available_signals,
     columns_of,
     each_explains,
@@ -199,8 +200,7 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     fitted = ProjectedCurves(scan, scan.values(_curves_of(bases)))
     within = np.append(scan.within, np.full(SIMULATIONS, 3.0 * (observations.samples - len(observations.weight))))
     left, cross = np.zeros((len(scan.left), 1 + SIMULATIONS)), []  # of the readings and each simulation
-    for c, drawn in enumerate(_draws(selection)):
-        draws = scan.whitened(scan.scale[c] * drawn)
+    for c, draws in enumerate(_draws(selection, scan)):
         left[:, 0] += scan.left[:, c]
         left[:, 1:] += scan.squares_without_model(c, draws)[1:]
         of_draws = scan.without_model(c, fitted.columns[0], draws)[1:]
@@ -221,17 +221,15 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     return {"share_worse": float(np.mean(smallest_p[1:] <= smallest_p[0])), "simulations": SIMULATIONS}
 
 
-def _draws(selection: Selection) -> Values:
-    """Return draws from the noise of the fit, in units of the white noise of one sample: (3, n, s) array."""
-    observations, rng = selection.observations.less_stop_errors, np.random.default_rng(0)
-    blocks, weight = observations.blocks, observations.weight
-    label, noise = blocks.label(len(weight)), GaussMarkov(blocks, [selection.fit.setting])
-    found = []
-    for _ in range(3):
-        white = rng.standard_normal((len(weight), SIMULATIONS)) / np.sqrt(weight)[:, None]
-        mean = blocks.sums(weight[:, None] * white) / blocks.weight[:, None]
-        found.append(white + (noise.draw(rng, SIMULATIONS) - mean)[label])
-    return np.stack(found)
+def _draws(selection: Selection, scan: Scan) -> Iterator[Whitened]:
+    """Yield draws from the noise of the fit for each axis: s columns."""
+    rng, blocks, root = np.random.default_rng(0), scan.blocks, np.sqrt(scan.weight)[:, None]
+    label, noise = blocks.label(len(root)), GaussMarkov(blocks, [selection.fit.setting])
+    for scale in scan.scale:
+        white = rng.standard_normal((len(root), SIMULATIONS))
+        white -= root * (blocks.sums(root * white) / blocks.weight[:, None])[label]
+        white *= scale
+        yield Whitened(white, scan.noise.whitened(scale * noise.draw(rng, SIMULATIONS)))
 
 
 def _curves_of(bases: Sequence[Basis]) -> Curves:

@@ -29,7 +29,7 @@ from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Design, EffectColumns, free_curves, placed
 from pipeline.estimation.gates import min_delta_bic
 from pipeline.estimation.gauss_markov import GaussMarkov
-from pipeline.estimation.generalized_least_squares import JointFit, calibration_of, design_at
+from pipeline.estimation.generalized_least_squares import JointFit, calibration_of
 from pipeline.estimation.harm import fits_of, harmful, harmful_in_turns
 from pipeline.estimation.observations import ROLES, observe, without_each_recording
 from pipeline.estimation.posterior import posterior
@@ -78,7 +78,7 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
     design = fit.design(observations)
     products = design.products([fit.setting])[0]
     without_each = [
-        (design_at(rest, fit).products([fit.setting])[0], rest) for rest in without_each_recording(observations)
+        (design.reweighted(rest).products([fit.setting])[0], rest) for rest in without_each_recording(observations)
     ]
     ends = np.cumsum([len(part.weight) for part in observations.parts])
     of_block = np.searchsorted(ends, observations.blocks.first, side="right")  # index of the recording
