@@ -63,6 +63,7 @@ from pipeline.estimation.uncertainty_budget import (
     limited_effects,
     scatter_contribution,
 )
+from pipeline.physics.effects import effect_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -433,6 +434,7 @@ def given_calibration(sensor: str, method: Method) -> SensorCalibration:
     if part is None:
         raise CannotCalibrateError(f"the given calibration {source} holds nothing of the {sensor}")
     found = SensorCalibration.from_json(sensor, part)
+    found = replace(found, effects=tuple(_in_order(effect, sensor) for effect in found.effects))
     bench = part["of_the_bench"]
     every = found.parameters
     kept = every.select(every.places([name for name in every.names if name.partition(".")[0] not in bench]))
@@ -446,6 +448,12 @@ def given_calibration(sensor: str, method: Method) -> SensorCalibration:
     freedom = np.full(len(kept), np.inf) if found.freedom is None else kept.degrees_of_freedom
     line = Contribution(GIVEN_SOURCE, "B", NORMAL, kept.covariance, freedom, remark=f"as {source} states it")
     return combined(calibration, [line], {})
+
+
+def _in_order(fitted: FittedEffect, sensor: str) -> FittedEffect:
+    """Return an effect with its parameters in their order; settings are stored in that of the names."""
+    names = [parameter.name for parameter in effect_of(fitted).parameters(sensor)]
+    return replace(fitted, parameters={name: fitted.parameters[name] for name in names})
 
 
 def unknown_uncertainty(sensor: str, method: Method) -> dict[str, str]:

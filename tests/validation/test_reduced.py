@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+import pipeline
 from pipeline.app.commands.add import changed_files
 from pipeline.app.commands.convert import main as convert
 from pipeline.app.one_unit import unit_of_recordings
@@ -19,6 +20,7 @@ from pipeline.physics.effects import catalogue
 from pipeline.physics.effects.base import Owner
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
+from tests.study.listed_recordings import Unit
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -126,3 +128,48 @@ def test_add_names_the_files_whose_error_changes() -> None:
     (line,) = [line for line in changed_files("U", was, now) if "px4.params" in line]
     change = f"{error:.3g} -> {1.2 * error:.3g} g: "
     assert line.startswith(f"U, accelerometer, held-out error of files that hold less {change}")
+
+
+@pytest.fixture
+def soaked(tmp_path: Path) -> tuple[Path, list[str]]:
+    """Two soaks of a unit in one attitude, one held out, with cubic biases; and the settings that fit these."""
+    simulated = Unit(tmp_path, np.random.default_rng(3))
+    cold = np.linspace(-15.0, 60.0, 1500)
+    for name, warmth, row in (("heat", cold, "soak"), ("cool", cold[::-1], "soak,,,,yes")):
+        t = (warmth - 25.0)[:, None]
+        force = np.array([0.1, -0.2, 0.97]) + t * 3e-4 + t**2 * np.array([2e-6, -1e-6, 2e-5])
+        rate = t * np.array([1e-3, -2e-3, 5e-4]) + t**3 * 1e-6
+        simulated.write(name, row, force, rate, warmth=warmth, hz=2.0, between=0.0)
+    simulated.sheet()
+    effects = [f"effects.{sensor}=[bias_temperature_cubic]" for sensor in ("accelerometer", "gyroscope")]
+    return tmp_path, effects
+
+
+def test_one_attitude_determines_no_matrix_of_a_format(soaked: tuple[Path, list[str]]) -> None:
+    """The change over temperature alone would determine one, of factors from 0.004 to 5."""
+    folder, effects = soaked
+    result = pipeline.calibrate(folder, sensor="mpu6050", procedure="listed", overrides=effects)
+    assert result.accelerometer is not None
+    held = [r for r in result.validation["accelerometer"]["reduced"] if r["part"] == "full"]
+    assert held
+    for each in held:
+        np.testing.assert_allclose(each["matrix"], result.accelerometer.matrix)
+        assert np.abs(each["bias"]).max() < 0.2
+
+
+def test_a_given_calibration_keeps_the_order_of_parameters(soaked: tuple[Path, list[str]]) -> None:
+    folder, effects = soaked
+    fitted = pipeline.calibrate(folder, sensor="mpu6050", procedure="listed", overrides=effects)
+    fitted.save(folder / "out")
+    file = next((folder / "out" / "calibrations").iterdir())
+    given = pipeline.calibrate(
+        folder, sensor="mpu6050", procedure="listed", method="given", overrides=[f"method.file={file}"]
+    )
+    for sensor in ("accelerometer", "gyroscope"):
+        parameters = [r.calibration[sensor]["effects"][0]["parameters"] for r in (fitted, given)]
+        assert list(parameters[0]) == list(parameters[1])
+        for name, value in parameters[0].items():
+            assert parameters[1][name]["value"] == pytest.approx(value["value"])
+            assert parameters[1][name]["expanded_uncertainty"] == pytest.approx(value["expanded_uncertainty"], rel=0.2)
+        last = [r.validation[sensor]["steps"][-1]["rms_error"] for r in (fitted, given)]
+        assert last[1] == pytest.approx(last[0])

@@ -5,9 +5,10 @@ that a format holds, the accelerometer's matrix S and bias b minimise
 
     sum |t - S (r - b)|^2,    S: full, diagonal, or 1
 
-A gyroscope turns to one side more than to the other, so that a fitted bias would not be that at rest: its diagonal is
-``s_i = K_ii / |K_i|^2``, with K the inverse of the full matrix, and its bias contains the mean of the effects that are
-not held and do not depend on the rate, as the bias of a fit without them does.
+S is that of the calibration where the attitudes do not determine it. A gyroscope turns to one side more than to the
+other, so that a fitted bias would not be that at rest: its diagonal is ``s_i = K_ii / |K_i|^2``, with K the inverse of
+the full matrix, and its bias contains the mean of the effects that are not held and do not depend on the rate, as the
+bias of a fit without them does.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from pipeline.core.records import Reduced
 from pipeline.evaluation.held_out.error_breakdown import rms_error_of, with_known_effects
 from pipeline.physics.effects import effect_of, owner_of
-from pipeline.physics.effects.base import Owner
+from pipeline.physics.effects.base import OF_THE_BIAS, Owner
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,18 +29,18 @@ if TYPE_CHECKING:
     from pipeline.core.records import FittedEffect, SensorCalibration, Values
     from pipeline.evaluation.held_out.samples import HeldOutCase, Samples
 
-BIAS_OVER_TEMPERATURE = ("bias_temperature", "bias_temperature_quadratic", "bias_temperature_cubic")
 # part of the matrix, and effects, of the formats in ``pipeline/output/exports/templates``
 HELD: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("full", ()),
     ("full", ("g_sensitivity",)),
-    ("full", BIAS_OVER_TEMPERATURE),
-    ("full", (*BIAS_OVER_TEMPERATURE, "scale_factor_temperature")),
+    ("full", OF_THE_BIAS),
+    ("full", (*OF_THE_BIAS, "scale_factor_temperature")),
     ("diagonal", ()),
-    ("diagonal", BIAS_OVER_TEMPERATURE),
+    ("diagonal", OF_THE_BIAS),
     ("none", ()),
-    ("none", BIAS_OVER_TEMPERATURE),
+    ("none", OF_THE_BIAS),
 )
+LEAST_SPREAD_G = 0.1  # rms in each direction; in one attitude, effects alone would determine a matrix
 FEWEST_ROWS = 6  # orientations, of which an axis has an offset and three factors
 AT_REST_TOO = {"time", "temperature", "specific_force"}  # signals
 
@@ -90,20 +91,20 @@ def _fitted(calibration: SensorCalibration, part: str, left: Values, truth: Valu
     """Return bias and matrix; ``left``: calibrated readings without the effects that are not held, (n, 3)."""
     K = np.linalg.inv(calibration.matrix)
     diagonal = np.diag(np.diag(K) / np.sum(K**2, axis=1))
+    matrix: Values = {"full": calibration.matrix, "diagonal": diagonal, "none": np.eye(3)}[part]
     if calibration.sensor == "gyroscope":
-        matrix = {"full": calibration.matrix, "diagonal": diagonal, "none": np.eye(3)}[part]
         if left is truth:
-            return calibration.bias, np.asarray(matrix)
+            return calibration.bias, matrix
         change = left - truth
         change = change[np.isfinite(change).all(axis=1)]
-        return calibration.bias + np.mean(change @ K.T, axis=0), np.asarray(matrix)
+        return calibration.bias + np.mean(change @ K.T, axis=0), matrix
     known = np.isfinite(left + truth).all(axis=1)
     left, truth = left[known], truth[known]
     reading = left @ K.T  # minus the bias
     ones = np.ones((len(reading), 1))
-    matrix = np.eye(3)
-    if part == "none":
-        offset = np.mean(truth - reading, axis=0)
+    spread = np.linalg.svd(reading - reading.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(reading))
+    if part == "none" or spread < LEAST_SPREAD_G:
+        offset = np.mean(truth - reading @ matrix.T, axis=0)
     elif part == "full":
         *rows, offset = np.linalg.lstsq(np.hstack([reading, ones]), truth, rcond=None)[0]
         matrix = np.array(rows).T
