@@ -148,11 +148,7 @@ def octave_variances(stretches: Sequence[Values], interval: float) -> tuple[Valu
     """
     longest = max(len(values) for values in stretches) // 4
     lengths = 2 ** np.arange(int(np.log2(longest)) + 1)
-    squares, terms, freedom = (
-        np.zeros((len(lengths), stretches[0].shape[1])),
-        np.zeros(len(lengths)),
-        np.zeros(len(lengths)),
-    )
+    squares, (terms, freedom) = np.zeros((len(lengths), stretches[0].shape[1])), np.zeros((2, len(lengths)))
     for values in stretches:
         n = len(values)
         theta = np.zeros((n + 1, values.shape[1]))

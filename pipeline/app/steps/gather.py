@@ -178,10 +178,8 @@ def _statistics(job: Job, units: Mapping[str, JSON], parameters: pd.DataFrame, n
 def _write_campaign(job: Job, units: Mapping[str, JSON], parameters: pd.DataFrame, new: Path, *, packed: bool) -> None:
     """Write the files that summarise all units."""
     run, rows = job.run, [u["row"] for u in units.values()]
-    failures, statistics = (
-        [u["failure"] for u in units.values() if u["failure"]],
-        _statistics(job, units, parameters, new),
-    )
+    failures = [u["failure"] for u in units.values() if u["failure"]]
+    statistics = _statistics(job, units, parameters, new)
     write_summary(new / "summary.csv", rows)
     write_json(new / "failures.json", failures)
     write_parameters(new / "parameters.parquet", rows, parameters)

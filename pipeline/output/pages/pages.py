@@ -174,17 +174,13 @@ def budget_section(budget: JSON) -> Markup:
     return section
 
 
-def headings(columns: Sequence[str]) -> Markup:
-    """Return the cells of a table's head; "#" before a name aligns its column as numbers."""
-    return Markup("").join(map(_heading, columns))
-
-
 @lru_cache(512, typed=True)  # as ``typeset``; a text and markup differ
-def _heading(name: str) -> Markup:
-    if not name:
-        return Markup("<td></td>")
+def heading(name: str) -> Markup:
+    """Return a cell of a table's head; "#" before its name aligns the column as numbers."""
     of_numbers = Markup(' class="n"') if name.startswith("#") else ""
-    return Markup('<th scope="col"{}>{}</th>').format(of_numbers, name.removeprefix("#"))
+    return (
+        Markup('<th scope="col"{}>{}</th>').format(of_numbers, name.removeprefix("#")) if name else Markup("<td></td>")
+    )
 
 
 def _figure(value: object, scale: Scale | None = None) -> str:
@@ -215,7 +211,7 @@ def _environment() -> Environment:
     environment.filters |= {one.__name__: one for one in of_numbers}
     environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text}
     environment.filters |= {"parameter_texts": parameter_texts, "details": stage_details, "monte_carlo": monte_carlo_of}
-    environment.filters |= {"script_data": script_data, "numeric": "#{}".format, "headings": headings}
+    environment.filters |= {"script_data": script_data, "numeric": "#{}".format, "heading": heading}
     environment.globals |= {
         "asset": asset,
         "unit_link": unit_link,
