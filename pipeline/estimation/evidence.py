@@ -232,22 +232,15 @@ class CandidateBlock:
         above = evidence - best[:, owner]
         total = best + np.log(np.add.reduceat(np.exp(above), first, axis=1))
         places = np.where(above == 0.0, np.arange(scales * count), scales * count)
-        picks = np.minimum.reduceat(places, first, axis=1) - first
-        rows = zip(total.tolist(), best.tolist(), picks.tolist(), strict=True)
-        return [
-            {n: Conditional(t, b, divmod(p, scales)) for n, t, b, p in zip(self.names, *row, strict=True)}
-            for row in rows
-        ]
+        rows = (each.tolist() for each in (total, best, np.minimum.reduceat(places, first, axis=1) - first))
+        found = [map(Conditional, t, b, (divmod(p, scales) for p in each)) for t, b, each in zip(*rows, strict=True)]
+        return [dict(zip(self.names, each, strict=True)) for each in found]
 
     def mixtures(self, number: int, names: Collection[str], problem: CandidateProblem) -> dict[str, Mixture]:
         """Return the distribution of the parameters of some of the effects over their limits, given one of the sets."""
         mixtures = {}
-        score, inner, cross, squares = (
-            self.score[:, :, number],
-            self.inner[:, number],
-            self.cross[:, number],
-            self.squares[:, :, number],
-        )
+        score, squares = self.score[:, :, number], self.squares[:, :, number]
+        inner, cross = self.inner[:, number], self.cross[:, number]
         top = np.maximum.reduceat(np.max(score, axis=(0, 1)), self.starts)
         owner = np.repeat(np.arange(len(self.names)), np.diff([*self.starts, score.shape[2]]))
         kept = score > top[owner] + np.log(NEGLIGIBLE_MIXTURE_WEIGHT)

@@ -123,8 +123,7 @@ class FormProducts:
             (r, members, np.array([[places(tried[k], axis) for k in members] for axis in range(axes)]))
             for (r, axes), members in alike.items()
         ]
-        F, G = (np.stack([column for _, column in known.values()], axis=1) for known in kinds)
-        self.factors, self.modulators = F, G
+        F, G = self.columns = [np.stack([column for _, column in known.values()], axis=1) for known in kinds]
         weighted, edges = scan.weight[:, None] * G, [*scan.blocks.first.tolist(), len(F)]
         sums = np.stack([F[at].T @ weighted[at] for at in starmap(slice, pairwise(edges))])
         self.means = sums.reshape(len(sums), -1) / scan.blocks.weight[:, None]
@@ -169,7 +168,7 @@ class FormProducts:
     def _with_columns(self, scan: Scan, at: slice) -> Values:
         columns = np.sqrt(scan.weight)[:, None] * scan.every.inside[:, at]
         shape = *self.inside.shape, columns.shape[1]
-        inside = self.factors.T @ (self.modulators[:, :, None] * columns[:, None]).reshape(len(columns), -1)
+        inside = self.columns[0].T @ (self.columns[1][:, :, None] * columns[:, None]).reshape(len(columns), -1)
         between = self.means.T @ scan.noise.solve(scan.means(scan.columns[:, at]))
         return np.asarray(between.reshape(-1, *shape) + inside.reshape(shape))
 
