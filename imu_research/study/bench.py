@@ -49,10 +49,11 @@ from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.base import truth
 from pipeline.physics.kinematics import reference_motion
 from pipeline.simulation.campaign import Streams, random_environment, simulate_unit
-from pipeline.simulation.description import UnitDescription, shipped_settings
+from pipeline.simulation.description import Course, UnitDescription, shipped_settings
+from pipeline.simulation.trajectory import Planned, random_gimbals
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from pipeline.core.settings import DataSheet
 
@@ -70,11 +71,18 @@ CURVES: dict[str, Callable[[Values], Values]] = {  # of the scaled temperature
     "saturation": lambda x: np.tanh(4.0 * x),
     "exponential": lambda x: np.expm1(3.0 * x) / np.expm1(3.0),
 }
+WITHHELD = "withheld"
 GAUSS_MARKOV = ("normal", "wander")  # families of noise for which lambda is known
 
 
-def recordings_of(case: StudyCase) -> list[Recording]:
-    """Return the recordings of a case, without its truth."""
+def withheld_of(case: StudyCase) -> Recording:
+    """Return motion on the table after the recordings of a case, which no step of a run sees."""
+    motion = random_gimbals(Course.validation_s, Course.validation_rate_dps, np.random.default_rng([case.seed, 2]))
+    return recordings_of(case, [Planned(WITHHELD, "validation", None, motion)])[-1]
+
+
+def recordings_of(case: StudyCase, extra: Sequence[Planned] = ()) -> list[Recording]:
+    """Return the recordings of a case, and of motion after them, without its truth."""
     sensor_model = shipped_settings(sensor=case.model).sensor
     noise_settings = {
         sensor: {
@@ -100,7 +108,7 @@ def recordings_of(case: StudyCase) -> list[Recording]:
         temperature={} if case.room_degc is None else {"drift": case.room_degc},
         imperfections=PERFECT,  # errors of the table would be effects that are not in the truth of the case
     )
-    recordings, _ = simulate_unit(unit, case.seed, case.number)
+    recordings, _ = simulate_unit(unit, case.seed, case.number, extra)
     if case.procedure == "at_rest":
         recordings = [
             r.select((r.table_rate == 0.0) & (np.diff(r.table_angle, prepend=0.0) == 0.0))
@@ -161,7 +169,8 @@ def _with_shape(recordings: list[Recording], case: StudyCase) -> list[Recording]
         room = random_environment(Streams(case.seed, case.number)["room"])
         room = room if case.room_degc is None else replace(room, drift=case.room_degc)
         temperatures = [room.temperature(r.time) for r in recordings]
-        low, high = min(float(w.min()) for w in temperatures), max(float(w.max()) for w in temperatures)
+        seen = np.concatenate([w for w, r in zip(temperatures, recordings, strict=True) if r.name != WITHHELD])
+        low, high = float(seen.min()), float(seen.max())
         signals = [CURVES[case.shape]((w - low) / (high - low)) for w in temperatures]
     else:
         signals = [_of_motion(case.shape, r) for r in recordings]

@@ -17,6 +17,7 @@ class HeldOut(NamedTuple):
     before: float
     after: float
     floor: float
+    raised: bool = False  # whether the error rises significantly where no step saw it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +25,7 @@ class Diagnosed:
     """What is scored of a diagnosis; without one, nothing is selected."""
 
     selected: list[str] = field(default_factory=list)
+    offered: bool = False  # whether there is an override that adds the selected effects
     look_alikes: dict[str, dict[str, float]] = field(default_factory=dict)  # of selected effects, with their share
     verdict: str = ""
     plausible: bool = True

@@ -21,14 +21,18 @@ from dataclasses import replace
 from multiprocessing import get_context
 from typing import TYPE_CHECKING, Literal
 
-from imu_research.study.bench import at_detection, recordings_of, signals_left
+from imu_research.study.bench import at_detection, recordings_of, signals_left, withheld_of
 from imu_research.study.cases import METHODS, StudyCase, draw
 from pipeline.app.config import code_digest
 from pipeline.app.one_unit import unit_of_recordings, unit_row
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError, PipelineError
-from pipeline.core.records import SENSORS, NotCalibrated
+from pipeline.core.records import SENSORS, NotCalibrated, SensorCalibration
+from pipeline.estimation.harm import harmful_on_held_out
 from pipeline.estimation.stages import stage_module
+from pipeline.evaluation.held_out.error_breakdown import errors_of
+from pipeline.evaluation.held_out.samples import HeldOutCase
 from pipeline.physics.effects import leaving_out
+from pipeline.simulation.description import shipped_settings
 from pipeline.unit import STEPS, tasks_of
 
 if TYPE_CHECKING:
@@ -132,7 +136,7 @@ def judge(case: StudyCase) -> list[JSON]:
         if whole:
             result["whole"] = scored(whole, sensor)
         if case.kind in FAMILIES_WITH_HELD_OUT_ERRORS:
-            result["held_out"] = held_out_errors(unit, state, sensor, result["selected"])
+            result["held_out"] = held_out_errors(unit, state, case, result["selected"])
         out.append(result)
     spent = (time.process_time() - began) / len(out)
     return [result | {"cpu_s": spent} for result in out]
@@ -158,6 +162,7 @@ def scored(state: UnitState, sensor: str) -> JSON:
     return {
         "verdict": document["verdict"],
         "selected": document["selected"],
+        "offered": bool(document["override"]),
         "plausible": all(entry["plausible"] for entry in selected),
         "inflated": bool((document["wander"] or {}).get("inflated")),
         "look_alikes": {
@@ -171,20 +176,35 @@ def scored(state: UnitState, sensor: str) -> JSON:
     }
 
 
-def held_out_errors(unit: ConfiguredUnit, state: UnitState, sensor: str, names: Sequence[str]) -> JSON:
+def held_out_errors(unit: ConfiguredUnit, state: UnitState, case: StudyCase, names: Sequence[str]) -> JSON:
     """Return the held-out error before and after effects are added to a validated unit, and the noise floor.
 
-    It is the error of the vector where the attitude is logged, else of the magnitude. Raises ``CannotCalibrateError``
-    if the recordings do not determine the effects.
+    It is the error of the vector where the attitude is logged, else of the magnitude. ``raised``: whether it rises
+    significantly (``pipeline.estimation.harm``) on motion that no step saw or, by hand, at the held-out rests. Raises
+    ``CannotCalibrateError`` if the recordings do not determine the effects.
     """
+    sensor = case.sensor
     before, floor = _error(state, sensor)
-    after = before
-    if names:
-        others = {other: fit for other, fit in state.fits.items() if other != sensor}
-        adding = unit.with_effects(sensor, names)
-        adding = replace(adding, stages={sensor: adding.stages[sensor]})
-        after, _ = _error(adding.run_to("validate", first="fit", state=replace(state, fits=others)), sensor)
-    return {"before": before, "after": after, "floor": floor}
+    if not names:
+        return {"before": before, "after": before, "floor": floor, "raised": False}
+    others = {other: fit for other, fit in state.fits.items() if other != sensor}
+    adding = unit.with_effects(sensor, names)
+    adding = replace(adding, stages={sensor: adding.stages[sensor]})
+    added = adding.run_to("validate", first="fit", state=replace(state, fits=others))
+    return {"before": before, "after": _error(added, sensor)[0], "floor": floor, "raised": _raised(state, added, case)}
+
+
+def _raised(state: UnitState, added: UnitState, case: StudyCase) -> bool:
+    """Return whether the error of a unit rises significantly with the effects that were added."""
+    known, settings = state.recordings, shipped_settings(sensor=case.model, table=case.table)
+    fits = [fit for each in (state, added) if isinstance(fit := each.fits[case.sensor], SensorCalibration)]
+    noise = known.noises[case.sensor] if known else None
+    if known is None or noise is None or len(fits) < 2:
+        return False
+    seen = [r for r in known.filtered if case.by_hand or r.role != "validation"]
+    recordings = [*seen, *([] if case.by_hand else [withheld_of(case)])]
+    errors, times = errors_of(fits, HeldOutCase(fits[0], recordings, noise, settings).held_out_samples())
+    return bool(harmful_on_held_out(["what was added"], errors, times, noise))
 
 
 def _error(state: UnitState, sensor: str) -> tuple[float, float]:

@@ -35,7 +35,6 @@ OF_WHICH = "... of those in which each stands out (lambda >= 100)"
 IN_THE_CATALOGUE = ("single", "pairs", "triples", "one_axis")
 MAY_HIDE = ("single", "small", "tiny", "one_axis", "pairs", "pairs_wander", "triples")
 LOOK_ALIKE_SIGNAL_SHARE = 0.95  # share of a signal above which effects are look-alikes, as on the pages
-HARM = 1.01  # times the held-out error before
 EXCESS = 0.05  # of the noise floor: smallest held-out excess that is counted
 GATES = (6.0, 8.0, MIN_DELTA_BIC, 12.0, 14.0, 16.0, 20.0, MIN_DELTA_BIC_OF_SLOW)  # at which false selections count
 OF_SENSOR_FILE = ("white", "normal")  # noise of the families that the sensor file describes
@@ -115,8 +114,8 @@ def hard_to_replace(case: ScoredCase) -> bool:
 
 
 def harmless(case: ScoredCase) -> bool:
-    """Return whether what was selected does not raise the held-out error by more than 1 %."""
-    return case.held_out is not None and case.held_out.after <= HARM * case.held_out.before
+    """Return whether what is offered does not raise the error significantly where no step saw it."""
+    return case.held_out is not None and not case.held_out.raised
 
 
 def excess_gone(case: ScoredCase) -> float | None:
@@ -194,7 +193,7 @@ def family_scores(cases: Sequence[ScoredCase]) -> list[MeasuredFigure]:
     by_hand = [c for c in cases if c.family.startswith("hand_")]
     seen = [c for c in by_hand if not c.error and not set(c.hidden) <= set(c.not_observable)]
     found += share("by hand, one effect that the recordings can show: named first", _judged(seen, first_is_right))
-    added = [c for c in cases if c.selected and c.held_out is not None and c.held_out.before is not None]
+    added = [c for c in cases if c.offered and c.held_out is not None and c.held_out.before is not None]
     offered = "an effect is offered: it does not raise the held-out error"
     found += share(offered, _judged(added, harmless), ">= 99 %")
     return found + mean_excess_gone(c for c in cases if c.family in IN_THE_CATALOGUE)

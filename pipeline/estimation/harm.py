@@ -3,9 +3,12 @@
 The differences d of the squared errors, with minus without an effect, of n units of exchange (rests, moves, stretches
 of turns, pieces of the held-out motion) have
 
-    mean(d) > t_95(m - 1) s(d) / sqrt(m),   m = n (1 - r) / (1 + r)
+    mean(d) > t sqrt(s(d)^2 / m + v),   m = n (1 - r) / (1 + r)
 
-with the correlation r of successive ones. The others stay selected.
+with the one-sided 95 % quantile t of Student's distribution, the correlation r of successive units, and the variance v
+of mean(d) by wander of the bias, which is in all of them and lowers the error of the one or the other fit by chance.
+Where v is known, r is the effect's own and counts as 0, and t is for all comparisons with fewer effects (Bonferroni).
+The others stay selected.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.multi_position.fit import COMPARED_STEP, fit
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
@@ -24,9 +28,9 @@ from pipeline.estimation.observations import without_rows
 from pipeline.estimation.ranking import projection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Collection, Sequence
 
-    from pipeline.core.records import Mask, Values
+    from pipeline.core.records import Mask, Noise, Values
     from pipeline.estimation.generalized_least_squares import JointFit
     from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.multi_position.model import Model
@@ -34,22 +38,27 @@ if TYPE_CHECKING:
     from pipeline.estimation.selection import Selection
 
 FEWEST_EXCHANGED = 5  # units of exchange that have a scatter
-HARM_CONFIDENCE, MAX_CORRELATION = 0.95, 0.9  # one-sided; r of successive units, see above
+MAX_FALSE_HARM, MAX_CORRELATION = 0.05, 0.9  # one-sided; r of successive units, see above
 REST_FOLDS = 3  # as every third rest is held out of a published fit (procedure.holdout_every)
 TURN_FOLDS, LEFT_OUT_STRETCHES = 5, 20  # a fold leaves out a fifth of every recording, in four stretches
+HELD_OUT_PIECES = 20  # of held-out motion: some seconds each
 SPARE = 2  # least number of equations beyond the parameters in a fold
 
 
-def harmful(names: Sequence[str], squares: Sequence[Values], what: str) -> dict[str, str]:
+def harmful(
+    names: Sequence[str], squares: Sequence[Values], what: str, shared: Callable[[int, int], float] | None = None
+) -> dict[str, str]:
     """Return the last of the selected effects with which the error rises significantly, with the reason.
 
-    ``squares``: of each unit of exchange, without effects, and with each further one; ``what``: the error, in words. An
-    effect may raise the error while another one is missing, so that all are compared with fewer.
+    ``squares``: of each unit of exchange, without effects, and with each further one; ``what``: the error, in words;
+    ``shared``: returns v above, of two of the squares. An effect may raise the error while another one is missing, so
+    that all are compared with fewer.
     """
     found: dict[str, str] = {}
     count = len(names)
     while count:
-        fewer = next((k for k in range(count - 1, -1, -1) if _raises(squares[k], squares[count])), None)
+        known = [(shared(k, count), count) if shared else () for k in range(count)]
+        fewer = next((k for k in range(count - 1, -1, -1) if _raises(squares[k], squares[count], *known[k])), None)
         if fewer is None:
             break
         ratio = float(np.sqrt(np.mean(squares[count]) / np.mean(squares[fewer])))
@@ -58,26 +67,50 @@ def harmful(names: Sequence[str], squares: Sequence[Values], what: str) -> dict[
     return found
 
 
-def _raises(before: Values, after: Values) -> bool:
+def _raises(before: Values, after: Values, shared: float = 0.0, comparisons: int = 1) -> bool:
     """Return whether the mean of the squared errors of units of exchange rises significantly: (n,) arrays in order."""
     change, n = after - before, len(after)
     if n < FEWEST_EXCHANGED or not np.mean(change) > 0.0:
         return False
     apart = change - np.mean(change)
     r = float(np.clip(apart[1:] @ apart[:-1] / max(float(apart @ apart), 1e-300), 0.0, MAX_CORRELATION))
-    m = n * (1.0 - r) / (1.0 + r)
-    limit = float(scipy.special.stdtrit(max(m - 1.0, 1.0), HARM_CONFIDENCE))
-    return bool(np.mean(change) > limit * np.std(change, ddof=1) / np.sqrt(m))
+    m = n if shared else n * (1.0 - r) / (1.0 + r)
+    limit = float(scipy.special.stdtrit(max(m - 1.0, 1.0), 1.0 - MAX_FALSE_HARM / comparisons))
+    return bool(np.mean(change) > limit * np.sqrt(np.var(change, ddof=1) / m + shared))
 
 
-def fits_of(selection: Selection) -> list[JointFit]:
-    """Return the fits of the base and with each further selected effect."""
-    fits = [selection.base]
-    fitted = {term.effect.name: term for term in selection.fit.terms}
-    for count in range(1, len(selection.names)):
-        terms = [*selection.base.terms, *(fitted[name] for name in selection.names[:count])]
-        fits.append(fit_terms(selection.observations, terms, selection.fit, selection.settings))
-    return [*fits, selection.fit] if selection.names else fits
+def harmful_on_held_out(names: Sequence[str], errors: Values, time: Values, noise: Noise) -> dict[str, str]:
+    """Return the effects that raise the error on held-out motion, with the reason; ``time``: (n,), s.
+
+    ``errors``: before effects are added, and with each further one: (c, n, 3) of vectors or (c, n, 1) of magnitudes.
+    """
+    count = min(HELD_OUT_PIECES, len(time))
+    squares = [np.array([p.mean() for p in np.array_split(np.sum(e**2, axis=1), count)]) for e in errors]
+    start, end = (np.array([p[k] for p in np.array_split(time, count)]) for k in (0, -1))
+    correlation = block_covariance(start, end - start, noise.correlation_time)
+    variance = noise.wander**2 if errors.shape[2] > 1 else np.mean(noise.wander**2)
+
+    def shared(before: int, after: int) -> float:
+        """Return the variance of ``2 mean(d^T m)`` by the wander m, with the change d of the calibrated readings."""
+        change = np.array([2.0 * p.mean(axis=0) for p in np.array_split(errors[after] - errors[before], count)])
+        return float(np.sum(change * (correlation @ change) * variance)) / count**2
+
+    return harmful(names, squares, "on held-out motion", shared)
+
+
+def fits_of(selection: Selection, left_out: Collection[str] = ()) -> list[JointFit]:
+    """Return the fits of the base, without some of its effects, and with each further selected effect."""
+    names = selection.names
+    known = {} if left_out else {len(names): selection.fit, 0: selection.base}
+    base = [term for term in selection.base.terms if term.effect.name not in left_out]
+    of = {term.effect.name: term for term in selection.fit.terms}
+    return [
+        known.get(count)
+        or fit_terms(
+            selection.observations, [*base, *(of[n] for n in names[:count])], selection.fit, selection.settings
+        )
+        for count in range(len(names) + 1)
+    ]
 
 
 def harmful_in_turns(selection: Selection, fits: Sequence[JointFit]) -> dict[str, str]:

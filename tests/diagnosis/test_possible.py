@@ -9,6 +9,7 @@ from unit_settings import settings_of
 
 from pipeline.core.records import Candidate, Estimate, Noise, Recording, SensorCalibration, SensorDiagnosis
 from pipeline.core.verdicts import Verdict
+from pipeline.estimation import harm
 from pipeline.estimation.harm import harmful
 from pipeline.evaluation.diagnosis.diagnose import without_harmful, without_impossible
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput
@@ -117,6 +118,22 @@ def test_effects_that_raise_the_error_of_units_of_exchange_are_not_offered() -> 
     assert harmful(["a"], [noise[:3], worse[:3]], "") == {}  # too few
     slow = np.cumsum(rng.standard_normal(20))  # successive units that rise and fall together show little
     assert harmful(["a"], [noise, noise + slow - slow.mean() + 0.3 * slow.std()], "") == {}
+    assert harmful(["a"], [noise, worse], "", lambda _before, _after: 0.2**2) == {}  # shared by all units
+
+
+def test_the_change_of_a_held_out_error_by_wander_has_the_stated_variance(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, time, rows = np.random.default_rng(2), 0.4 * np.arange(150), 800
+    bias, rate = np.array([0.03, -0.01, 0.02]), np.array([1e-3, 0.0, -1e-3])
+    change = bias + rate * np.sin(time / 20.0)[:, None]  # between two calibrations
+    wander, tau = np.array([0.01, 0.02, 0.03]), 30.0
+    factor = np.linalg.cholesky(np.exp(-np.abs(time[:, None] - time) / tau) + 1e-12 * np.eye(len(time)))
+    drawn = wander * np.einsum("ij,rjc->ric", factor, rng.standard_normal((rows, len(time), 3)))
+    rises = [np.mean(np.sum((m + change) ** 2 - m**2, axis=1)) for m in drawn]
+    seen: list[float] = []
+    monkeypatch.setattr(harm, "harmful", lambda _names, _squares, _what, shared: seen.append(shared(0, 1)))
+    errors, noise = np.array([drawn[0], drawn[0] + change]), Noise(0.01 * np.ones(3), wander, tau, "static")
+    harm.harmful_on_held_out(["a"], errors, time, noise)
+    assert np.sqrt(seen[0]) == pytest.approx(np.std(rises), rel=3.0 / np.sqrt(2 * rows))
 
 
 def test_an_effect_that_harms_is_a_candidate_and_the_others_stay() -> None:

@@ -200,8 +200,9 @@ def test_by_hand_only_another_effect_counts_against_the_diagnosis() -> None:
 
 
 def test_harm_is_a_held_out_error_that_an_offered_effect_raises() -> None:
-    errors = [{"before": 1.0, "after": after, "floor": 0.1} for after in (0.5, 1.005, 1.2)]
-    cases = [case(truth("a"), said("a", held_out=each)) for each in errors]
+    errors = [{"before": 1.0, "after": 1.2, "floor": 0.1, "raised": raised} for raised in (False, False, True)]
+    cases = [case(truth("a"), said("a", held_out=each, offered=True)) for each in errors]
+    cases.append(case(truth("a"), said("a", held_out=errors[2], offered=False)))
     scores = {s.name: s for s in family_scores(cases)}
     harm = scores["an effect is offered: it does not raise the held-out error"]
     assert (harm.value, harm.total, harm.missed) == (pytest.approx(2 / 3), 3, True)

@@ -65,7 +65,7 @@ from pipeline.evaluation.diagnosis.verdict import (
     may_be_unknown,
 )
 from pipeline.evaluation.diagnosis.words import plain
-from pipeline.evaluation.held_out.error_breakdown import last_step
+from pipeline.evaluation.held_out.error_breakdown import last_step, vector_errors
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, samples_of_motion
 from pipeline.evaluation.held_out.validation import last_error, static_error
 from pipeline.physics.effects import catalogue, effect, effect_of
@@ -460,10 +460,7 @@ def effective_noise(
 def _error(calibration: SensorCalibration, samples: Samples) -> Values | None:
     """Return the error of calibrated readings, (n, 3), or of their magnitude, (n, 1); None if an effect is left out."""
     corrected = last_step(calibration, samples)
-    if corrected is None:
-        return None
-    vector, magnitude, true = corrected
-    return (np.linalg.norm(vector, axis=1) - magnitude)[:, None] if true is None else vector - true
+    return None if corrected is None else vector_errors([corrected], directed=corrected[2] is not None)
 
 
 def _of_effect(calibration: SensorCalibration, samples: Samples, found: SensorDiagnosis, name: str) -> Values | None:

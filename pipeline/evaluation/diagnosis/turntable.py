@@ -30,11 +30,12 @@ from pipeline.estimation.design import Design, EffectColumns, free_curves, place
 from pipeline.estimation.gates import min_delta_bic
 from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import JointFit, calibration_of
-from pipeline.estimation.harm import fits_of, harmful, harmful_in_turns
+from pipeline.estimation.harm import fits_of, harmful_in_turns, harmful_on_held_out
 from pipeline.estimation.observations import ROLES, observe, without_each_recording
 from pipeline.estimation.posterior import posterior
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
+from pipeline.estimation.stages import last_fit
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, why_not_suggested
 from pipeline.evaluation.diagnosis.method_errors import method_errors
@@ -42,8 +43,8 @@ from pipeline.evaluation.diagnosis.observability import alike_with_zeros, never_
 from pipeline.evaluation.diagnosis.residual_dependence import dependences, goodness_of_fit, plots
 from pipeline.evaluation.diagnosis.verdict import verdict_of_selection
 from pipeline.evaluation.diagnosis.words import FAR_OFF, plain
-from pipeline.evaluation.held_out.error_breakdown import with_known_effects
-from pipeline.evaluation.held_out.samples import samples_of_motion
+from pipeline.evaluation.held_out.error_breakdown import errors_of
+from pipeline.evaluation.held_out.samples import HeldOutCase
 from pipeline.evaluation.held_out.validation import noise_floors
 from pipeline.physics.effects import catalogue, effect
 
@@ -62,7 +63,7 @@ DETERMINED = 1e-6  # least information on an effect's weakest direction, over th
 NEEDED_RECORDING = "record turns about all three axes on a table whose angle and rate are logged"
 # mean square of a residual over that of noise below which effects cannot explain a part of the excess
 UNEXPLAINABLE_RATIO = 1.1
-HELD_OUT_PIECES = 20  # of held-out motion: some seconds each
+NOISELESS = Noise(np.zeros(3), np.zeros(3), 1.0, "none")  # of recordings that determine no noise
 
 
 def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
@@ -217,8 +218,11 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     sensor, noise, selection, reported = case.sensor, case.noise, discovery.context, discovery.reported
     observations, unknown = selection.observations, discovery.unknown
     fits = fits_of(reported)
-    squares_held_out, floor = _held_out_squares(reported, fits, case)
-    errors = [float(np.sqrt(np.nanmean(squares))) for squares in squares_held_out]
+    motion, floor = _held_out(reported, fits, case)
+    errors = [] if motion is None else np.sqrt(np.mean(np.sum(motion[0][1:] ** 2, 2), 1)).tolist()
+    suggested = [str(discovery.suggested["name"])] if discovery.suggested else []  # in the base of ``reported``
+    added = fits_of(reported, suggested) if suggested else fits  # the override adds no formula
+    added_held_out = _held_out(reported, added, case)[0] if suggested else motion
     held_out = None
     if errors and noise is not None:
         held_out = SelectionErrors(errors[0], errors[-1], floor)
@@ -261,7 +265,6 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     def calibrated(fit: JointFit) -> SensorCalibration:
         return calibration_of(fit, selection.observations, None, case.settings)
 
-    suggested = [str(discovery.suggested["name"])] if discovery.suggested else []  # in the base of ``reported``
     scores = reported.ranking.log_likelihoods(reported.chosen())
     noises = list(zip(reported.ranking.settings, scores.tolist(), strict=True))[1:]  # the first is white noise
     return Findings(
@@ -279,7 +282,7 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
         drop_alone=drop_alone,
         excess=excess,
         held_out=errors or [None] * len(fits),
-        harmful=harmful_effects(reported, fits, squares_held_out),
+        harmful=harmful_effects(reported, added, added_held_out, noise),
         hidden={**hidden, **alike_with_zeros(reported)},
         unknown=unknown,
         over_noise=_over_noise(selection.base, case, reference),
@@ -308,38 +311,32 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     )
 
 
-def harmful_effects(selection: Selection, fits: Sequence[JointFit], squares: Sequence[Values]) -> dict[str, str]:
+def harmful_effects(
+    selection: Selection, fits: Sequence[JointFit], held_out: tuple[Values, Values] | None, noise: Noise | None
+) -> dict[str, str]:
     """Return the effects that raise the error on held-out motion or, without it, in left-out stretches of the turns."""
-    if not squares:
+    if held_out is None:
         return harmful_in_turns(selection, fits)
-    pieces = np.array([[np.nanmean(p) for p in np.array_split(each, HELD_OUT_PIECES)] for each in squares])
-    return harmful(selection.names, [*pieces[:, np.isfinite(pieces).all(axis=0)]], "on held-out motion")
+    errors, time = held_out
+    return harmful_on_held_out(selection.names, np.delete(errors, 1, axis=0), time, noise or NOISELESS)
 
 
-def _held_out_squares(
+def _held_out(
     selection: Selection, fits: Sequence[JointFit], case: DiagnosisInput
-) -> tuple[list[Values], float]:
-    """Return the squared held-out errors of each fit, and the noise floor of the last; none without held-out motion."""
-    noise = case.noise or Noise(np.zeros(3), np.zeros(3), 1.0, "none")
-    held = [r for r in case.recordings if r.role == "validation"] if selection.names else []
-    found = [samples_of_motion(case.sensor, r, noise, case.settings.table, smoothed=True) for r in held]
-    samples = [s for s in found if s is not None and s.known.any()]
-    if not samples:
-        return [], 0.0
+) -> tuple[tuple[Values, Values] | None, float]:
+    """Return ``errors_of`` of what effects would replace and of each fit, and the noise floor of the last fit.
+
+    The first is the published calibration if it is by a table's motion, else the base. None without held-out motion.
+    """
+    held_out = HeldOutCase(case.calibration, case.recordings, case.noise or NOISELESS, case.settings)
+    samples = held_out.held_out_samples(smoothed=True) if selection.names else []
+    if not any(s.known.any() for s in samples):
+        return None, 0.0
     calibrations = [calibration_of(fit, selection.observations, None) for fit in fits]
-    corrected = [[with_known_effects(calibration, each) for each in samples] for calibration in calibrations]
-    directed = all(true is not None for of_fit in corrected for _, _, true in of_fit)
-    found_squares: list[Values] = []
-    for of_fit in corrected:
-        squares = []
-        for each, (vector, magnitude, true) in zip(samples, of_fit, strict=True):
-            error = np.linalg.norm(vector, axis=1) - magnitude
-            if directed and true is not None:
-                error = np.linalg.norm(vector - true, axis=1)
-            squares.append(error[each.known] ** 2)
-        found_squares.append(np.concatenate(squares))
+    before = case.calibration if last_fit(case.calibration).reference else calibrations[0]
+    errors, time = errors_of([before, *calibrations], samples)
     floor, vector_floor = noise_floors(calibrations[-1], samples)
-    return found_squares, floor if vector_floor is None or not directed else vector_floor
+    return (errors, time), floor if vector_floor is None or errors.shape[2] == 1 else vector_floor
 
 
 def _shares(selection: Selection, name: str) -> dict[str, float]:

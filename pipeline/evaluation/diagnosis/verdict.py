@@ -30,8 +30,6 @@ UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by the selected effects: least de
 MAX_UNKNOWN_PROBABILITY = 0.5
 # the same if the held-out error with the selected effects is at the noise floor (thermal_ramp, long-004)
 LIKELY_AT_FLOOR = 0.9
-# of the noise's mean square: largest increase of the held-out mean square by the selected effects
-MAX_HELD_OUT_INCREASE = 0.3
 HELPFUL = 0.1  # least relative reduction of the held-out mean square by an effect that is offered
 LEFT_OVER = 1.05  # times the noise floor: four standard deviations of the rms of 3 x 1000 samples
 DISAGREES = 1e-4  # probability by chance; the smallest of 842 sensors of null families was 0.006
@@ -171,11 +169,6 @@ class VerdictInput:
         return self.held_out.error_after**2 > (1.0 - HELPFUL) * self.held_out.error_before**2
 
     @property
-    def made_worse(self) -> bool:
-        """Whether the selected effects raise the held-out error."""
-        return _made_worse(self.held_out)
-
-    @property
     def too_many(self) -> bool:
         """Whether more effects were selected than a unit usually has."""
         return len(self.selected) > BELIEVED
@@ -234,7 +227,7 @@ def verdict_of_selection(
     residual with them is far above the noise. ``beyond``: probability of physics outside the catalogue; its threshold
     is higher if held-out motion shows noise alone.
     """
-    if _made_worse(held_out) or len(names) > BELIEVED:
+    if len(names) > BELIEVED:
         return Verdict.UNEXPLAINED
     at_floor = held_out is not None and held_out.error_after <= held_out.floor
     if names and beyond > (LIKELY_AT_FLOOR if at_floor else MAX_UNKNOWN_PROBABILITY):
@@ -262,13 +255,6 @@ def if_observable(verdict: Verdict, ranking: Sequence[object], hidden: Mapping[s
     """Return the verdict by a selection whose candidates may all be ``hidden``: then it shows nothing."""
     shows_nothing = verdict == Verdict.NOTHING_MISSING and not ranking and hidden
     return Verdict.NOT_ENOUGH_DATA if shows_nothing else verdict
-
-
-def _made_worse(held_out: SelectionErrors | None) -> bool:
-    """Return whether the selected effects raise the held-out error: then they are not what is missing."""
-    if held_out is None:
-        return False
-    return held_out.error_after**2 - held_out.error_before**2 > MAX_HELD_OUT_INCREASE * held_out.floor**2
 
 
 def _of_residual(e: VerdictInput) -> str:

@@ -128,7 +128,28 @@ def left_out(calibration: SensorCalibration, samples: Sequence[Samples]) -> list
 def last_error_of_magnitude(calibration: SensorCalibration, samples: Samples) -> Values | None:
     """Return the error of the magnitude after the last step, (n,); None if an effect is left out."""
     found = last_step(calibration, samples)
-    return None if found is None else np.linalg.norm(found[0], axis=1) - found[1]
+    return None if found is None else vector_errors([found], directed=False)[:, 0]
+
+
+def errors_of(calibrations: Sequence[SensorCalibration], samples: Sequence[Samples]) -> tuple[Values, Values]:
+    """Return the errors of c calibrations, with the effects that can be subtracted, and the n times at which all are.
+
+    (c, n, 3), of the vector, if all samples have its direction, else (c, n, 1), of the magnitude.
+    """
+    found = [[with_known_effects(calibration, each) for each in samples] for calibration in calibrations]
+    directed = all(true is not None for of_one in found for _, _, true in of_one)
+    errors = np.array([vector_errors(of_one, directed=directed) for of_one in found])
+    known = np.concatenate([each.known for each in samples]) & np.isfinite(errors).all(axis=(0, 2))
+    return errors[:, known], np.concatenate([each.time for each in samples])[known]
+
+
+def vector_errors(corrected: Sequence[Corrected], *, directed: bool) -> Values:
+    """Return the errors of vectors, (n, 3), or, unless the direction is known, of their magnitudes, (n, 1)."""
+    parts = [
+        v - true if directed and true is not None else (np.linalg.norm(v, axis=1) - m)[:, None]
+        for v, m, true in corrected
+    ]
+    return np.asarray(np.concatenate(parts))
 
 
 def with_known_effects(calibration: SensorCalibration, samples: Samples) -> Corrected:
@@ -148,10 +169,10 @@ def _uncorrected(samples: Samples, readings: Values) -> Corrected:
 
 def _figures(name: str, corrected: Sequence[Corrected]) -> tuple[float, StepErrors]:
     """Return the mean absolute error of the magnitude, and all errors."""
-    error = np.concatenate([np.linalg.norm(vector, axis=1) - magnitude for vector, magnitude, _ in corrected])
+    error = vector_errors(corrected, directed=False)[:, 0]
     known = np.isfinite(error)
-    differences = [vector - true for vector, _, true in corrected if true is not None]
-    off = np.concatenate(differences)[known] if len(differences) == len(corrected) else None
+    directed = all(true is not None for _, _, true in corrected)
+    off = vector_errors(corrected, directed=True)[known] if directed else None
     error = error[known]
     mean = float(np.mean(np.abs(error)))
     return mean, StepErrors(
