@@ -34,11 +34,10 @@ from imu_logs.errors import IngestError
 from imu_logs.files import refuse_foreign, unchanged
 from imu_logs.log import Note
 from imu_logs.profile import Column, CsvFormat
-from imu_logs.text_write import to_numpy
 from imu_logs.units import ATTITUDE, CANONICAL, COUNTS, DEGREES, SCALARS, TRIADS, UNITS, unit_in_brackets
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from imu_logs.log import Integers, Values
@@ -61,12 +60,14 @@ LONGEST_HEADER = 1 << 16  # bytes that are searched for the line of names
 LAST_VERSION = "1.3"
 
 
-def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[int, str]) -> list[tuple[Column, int]]:
+def find_columns(
+    names: list[str], settings: CsvFormat, where: str, below: Callable[[], dict[int, str]]
+) -> list[tuple[Column, int]]:
     """Return the channels of a file, each with the index of its column.
 
     All columns of one sensor may be missing if those of the other sensor are found, and fewer than three other columns
-    could contain them under other names: then the log has one sensor. ``below``: the next lines, by their number, which
-    are searched for a header at another place.
+    could contain them under other names: then the log has one sensor. ``below`` returns the next lines by number, where
+    a header at another place is searched.
     """
     numbers = bool(settings.header) and all(NUMBER.fullmatch(n) for name in names for n in re.split(r"[;\t| ]+", name))
     twice = [] if numbers else sorted({n for n in names if n and names.count(n) > 1})
@@ -86,7 +87,7 @@ def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[
         near = {m: difflib.get_close_matches(m, names, 1) for m in missing}
         wanted = ", ".join(f"{m} (nearest: {n[0]})" if n else m for m, n in near.items())
         others = [f"column {wanted} missing; found {', '.join(names)[:300]}{other_separator(names)}", *others]
-        hint = "" if twice else _what_to_do(missing, names, settings, below, numbers=numbers)
+        hint = "" if twice else _what_to_do(missing, names, settings, below(), numbers=numbers)
         code = "duplicate_column" if twice else "no_header" if numbers else "missing_column"
         raise IngestError("; ".join(others), where, code=code, hint=hint)
     if others:
@@ -190,10 +191,10 @@ class TextLayout:
             table = self.parse(body, dict.fromkeys(wanted, pa.float64()))
         except pa.ArrowInvalid:
             return None
-        values = [to_numpy(table.column(str(i))) for i in wanted]
-        found = dict(zip(wanted, values, strict=True))
-        valid = table.num_rows == rows and all(bool(np.isfinite(v).all()) for v in values)
-        return found if valid else None
+        if table.num_rows != rows:
+            return None
+        values = table.to_batches()[0].to_tensor(row_major=False).to_numpy()
+        return dict(zip(wanted, values.T, strict=True)) if np.isfinite(values).all() else None
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,7 @@ class TextLog:
                 if self.head is None and len(before) > MAX_LINE_BYTES:
                     raise self.no_rows()
                 data = before[start:]
-                numbers = range(numbers.stop - data.count(b"\n"), numbers.stop)  # noqa: PLW2901
+                numbers = range(1 + before.count(b"\n", 0, start), numbers.stop)  # noqa: PLW2901
             if self.head is not None:
                 body, lines = self._rows(data, numbers)
                 if len(lines):
@@ -179,11 +179,12 @@ class TextLog:
     def _rows(self, data: bytes, numbers: range) -> tuple[bytes, Integers]:
         """Remove comments and empty lines; return the other lines and their numbers."""
         lines = np.arange(numbers.start, numbers.stop)
-        comment, empty = self.settings.comment, b"\n\n" in data or data.startswith(b"\n")
+        comment = self.settings.comment
         if self.settings.delimiter == WHITESPACE:
             data = _single_blanks(data)
-            empty = b"\n\n" in data or data.startswith(b"\n")
-        empty = empty or (b" \n" in data and BLANK_LINE.search(data) is not None)
+        each = np.frombuffer(data, np.uint8)
+        before = each[np.flatnonzero(each == NEWLINE) - 1]  # the byte before a newline; before the first, the last
+        empty = bool(np.any(before == NEWLINE)) or (b" "[0] in before and BLANK_LINE.search(data) is not None)
         if empty or (comment is not None and comment.encode() in data):
             parts = data.split(b"\n")[:-1]
             is_comment = np.array([self._is_comment(part) for part in parts], bool)

@@ -167,7 +167,9 @@ class TextRows:
     def finish(self, checks: Checks) -> None:
         """Join the blocks, and drop rows where the profile allows it."""
         layout, blocks = self.layout, self._blocks
-        columns = {k: np.concatenate([b.pop(k) for b in blocks]) for k in list(blocks[0] if blocks else ())}
+        if len(blocks) > 1:
+            blocks[:] = [{k: np.concatenate([b.pop(k) for b in blocks]) for k in list(blocks[0])}]
+        columns: dict[int, NDArray[Any]] = dict(*blocks)
         parted = [f.line for f in self._faults if f.parted_before]
         if parted and columns:
             keep = ~np.isin(columns[LINES], parted)
@@ -190,8 +192,11 @@ class TextRows:
         """Find the columns of the channels, by the head and the first rows."""
         head, settings = self.log.head, self.settings
         assert head is not None  # noqa: S101  (rows follow it)
-        text = body[:SEARCHED_BELOW].decode("utf-8", "replace").split("\n")[:LINES_BELOW]
-        below = dict(zip(lines.tolist(), text, strict=False))
+
+        def below() -> dict[int, str]:
+            text = body[:SEARCHED_BELOW].decode("utf-8", "replace").split("\n")[:LINES_BELOW]
+            return dict(zip(lines.tolist(), text, strict=False))
+
         columns = find_columns(head.names, settings, f"{self.path}:{head.line}", below)
         if settings.delimiter == AUTO:
             self.notes.append(Note("N-DELIM", 1, 0, 0, f"the separator is {head.delimiter!r}, by the header"))

@@ -37,7 +37,7 @@ import numpy as np
 
 from imu_logs.units import TRIADS
 from pipeline.checks.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, refusal
-from pipeline.core.records import SENSOR_UNITS, SENSORS, Note, median
+from pipeline.core.records import SENSOR_UNITS, SENSORS, Note, median, quantile
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.signal.rests import RATE_AT_REST, RATE_AT_REST_DPS, rests_from_table, runs
 
@@ -217,7 +217,7 @@ def _moving(
     """Return in which blocks a sensor moves, and the strongest evidence of it in words."""
     unit = SENSOR_UNITS[sensor]
     means, scatter = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
-    usual, middle = np.percentile(scatter, [25.0, 50.0], axis=0)
+    usual, middle = quantile(scatter, 0.25), median(scatter)
     tiny = np.finfo(float).tiny
     spread = np.minimum(
         np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE, MAX_SCATTER_DEVIATION
@@ -263,14 +263,15 @@ def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
         rows = np.concatenate([np.arange(0), *(np.arange(r.start, r.stop) for r in rests_from_table(recording))])
         angle = np.zeros(len(rows)) if recording.table_angle is None else recording.table_angle[rows]
         stepped = np.abs(np.diff(angle)) > STEPPED_DEG  # the table moved between two samples
-        pieces = np.split(rows, np.flatnonzero((np.diff(rows) > 1) | stepped) + 1)
-        rests = [piece for piece in pieces if len(piece) >= MIN_SAMPLES_OF_REST]
-        for sensor in SENSORS:
-            reading = recording.reading(sensor)
-            if reading is not None:
-                moments[sensor] += [
-                    _moments(reading[None, rest]) for rest in rests[:: len(rests) // MIN_RESTS_OF_SCATTER + 1]
-                ]
+        starts = np.concatenate([[0], np.flatnonzero((np.diff(rows) > 1) | stepped) + 1])
+        ends = np.append(starts[1:], len(rows))
+        long = np.flatnonzero(ends - starts >= MIN_SAMPLES_OF_REST)
+        found = {s: r for s in SENSORS if (r := recording.reading(s)) is not None}
+        for k in long[:: len(long) // MIN_RESTS_OF_SCATTER + 1]:
+            rest = rows[starts[k] : ends[k]]
+            both = _moments(np.concatenate([reading[rest] for reading in found.values()], axis=1)[None])
+            for i, sensor in enumerate(found):
+                moments[sensor].append(both[..., 3 * i : 3 * i + 3])
     return {sensor: np.concatenate(parts) for sensor, parts in moments.items()}
 
 
@@ -287,13 +288,15 @@ def _rests_by_hand(recordings: Sequence[Recording], sensor: str) -> Values:
 
 
 def _moments(blocks: Values) -> Values:
-    """Return scatter, white noise and mean of (k, n, 3) blocks: (k, 3, 3) array.
+    """Return scatter, white noise and mean of (k, n, m) blocks: (k, 3, m) array.
 
     The white noise by successive differences does not include slow changes (J. von Neumann, Annals of Mathematical
     Statistics 12 (1941), 367-395).
     """
     white = np.sqrt(np.mean(np.diff(blocks, axis=1) ** 2, axis=1) / 2.0)
-    return np.stack([blocks.std(axis=1, ddof=1), white, blocks.mean(axis=1)], axis=1)
+    mean = blocks.mean(axis=1)
+    scatter = np.sqrt(np.sum((blocks - mean[:, None]) ** 2, axis=1) / (blocks.shape[1] - 1))
+    return np.stack([scatter, white, mean], axis=1)
 
 
 def check_axes(recordings: Sequence[Recording]) -> None:
@@ -343,7 +346,7 @@ def _check_spans(recording: Recording) -> None:
         return
     stuck: list[tuple[str, float, str, str]] = []  # channel, its span, the required one with its unit, the rows
     if recording.gyroscope is not None:
-        required, spans = _span(rate), [_span(w) for w in recording.gyroscope.T]
+        required, spans = float(_span(rate)), _span(recording.gyroscope).tolist()
         turned_other = max(spans) >= SPANNED * required and int(np.argmax(spans)) != axis  # see check_mounting
         if required > LEAST_RATE_DPS and spans[axis] < SPANNED * required and not turned_other:
             stuck.append((TRIADS["gyroscope"][axis], spans[axis], f"{required:.3g} deg/s", "the rows"))
@@ -353,7 +356,7 @@ def _check_spans(recording: Recording) -> None:
     if recording.accelerometer is not None and np.ptp(angle) >= HALF_TURN_DEG:
         turns = np.abs(np.diff(angle, prepend=angle[0])) > RATE_AT_REST_DPS * recording.interval
         rows = turns if turns.sum() >= MIN_AXIS_SAMPLES else np.ones(len(angle), bool)  # rests may be most of the time
-        spans = [_span(f) for f in recording.accelerometer[-len(angle) :][rows].T]
+        spans = _span(recording.accelerometer[-len(angle) :][rows]).tolist()
         across = [(axis + 1) % 3, (axis + 2) % 3]
         # Not in a turn about the vertical or about another axis: see check_mounting.
         if max(spans[i] for i in across) >= LEVEL_G >= spans[axis]:
@@ -369,6 +372,6 @@ def _check_spans(recording: Recording) -> None:
         )
 
 
-def _span(values: Values) -> float:
+def _span(values: Values) -> Values:
     low, high = quantiles(values, *INNER)
-    return float(high - low)
+    return np.asarray(high - low)

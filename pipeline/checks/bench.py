@@ -53,7 +53,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipeline.core.errors import IngestError
-from pipeline.core.records import AXES
+from pipeline.core.records import AXES, cross
 from pipeline.ingest.axis_maps import (
     FAILS_DEG,
     MAX_ROTATION_SAMPLES,
@@ -107,7 +107,7 @@ class TurnMounting:
         """Whether the logged angle is that of the convention."""
         return self.sense == 1 and self.zero_deg == 0.0 and self.up == usual_up(self.axis)
 
-    @property
+    @cached_property
     def offset(self) -> float:
         """Convention's angle minus ``sense * A``, deg."""
         a, up = AXES.index(self.axis), signed_axis(self.up)
@@ -152,9 +152,10 @@ def off_at_rest(recording: Recording, bench: TurnMounting) -> float:
     Where all rests are at one angle, a bias of 0.1 g changes it by 6 deg.
     """
     angle, force = recording.table_angle, recording.accelerometer
-    if angle is None or force is None:
+    slope = recording.slope_of_angle
+    if angle is None or force is None or slope is None:
         return 0.0
-    still = still_samples(recording.time, np.gradient(angle, recording.time)) & recording.valid
+    still = still_samples(recording.time, slope) & recording.valid
     if np.sum(still) < MIN_ANGLE_SAMPLES:
         return 0.0
     A = np.radians(bench.sense * angle[still] + bench.offset)
@@ -219,7 +220,7 @@ class TurnFit:
         """Unit vector about which the unit turns as the angle grows, by gravity: (3,) array, or None."""
         if self.gravity is None or self.vertical is not None:
             return None
-        return unit(np.cross(self.gravity.sine, self.gravity.cosine))
+        return unit(cross(self.gravity.sine, self.gravity.cosine))
 
     @cached_property
     def vertical(self) -> Values | None:
@@ -234,8 +235,7 @@ class TurnFit:
 def fit_turn(recording: Recording) -> TurnFit:
     """Return c, p, q and k of a turn whose log has the table's angle, its rate, or both."""
     angle, rate = recording.table_angle, recording.table_rate
-    slope = None if angle is None or recording.samples < 2 else np.gradient(angle, recording.time)
-    used = slope if rate is None else rate
+    slope, used = recording.slope_of_angle, recording.logged_rate
     gain = _gain(recording, used)
     if gain is not None and rate is not None and slope is not None and float(rate @ slope) < 0.0:
         gain = -gain  # the rate counts against the angle: here the angle counts; the check of the reference refuses it
@@ -253,7 +253,9 @@ def fit_turn(recording: Recording) -> TurnFit:
     # Normal equations of all columns; the constant and the terms of the rate are eliminated.
     columns, m = np.column_stack([*terms, np.cos(A), np.sin(A), reading]), len(terms)
     products = columns.T @ columns
-    inverse = np.linalg.pinv(products[:m, :m], rcond=SMALLEST_SHARE, hermitian=True)
+    powers, vectors = np.linalg.eigh(products[:m, :m])
+    vectors = vectors[:, powers > SMALLEST_SHARE * powers[-1]]
+    inverse = vectors / powers[m - vectors.shape[1] :] @ vectors.T
     reduced = products[m:, m:] - products[m:, :m] @ inverse @ products[:m, m:]
     normal = reduced[:2, :2]
     if len(A) < MIN_ANGLE_SAMPLES or np.linalg.eigvalsh(normal / len(A))[0] < LEAST_COVERAGE:

@@ -68,6 +68,7 @@ RESOLUTION_NOTE = "N-RESOLUTION"
 SAME_STEP = 1e-6  # relative: rounding of a difference of decimals
 MAX_SIGNIFICANT_DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
 SAME_GRAVITY_G = 1e-4  # gravity changes by as much over 0.3 km of height
+TENFOLD = 10.0 ** np.arange(1, MAX_SIGNIFICANT_DIGITS)[:, None, None]
 OF_DECIMALS = 200  # samples that determine the decimals: a finer reading ends in a zero in a tenth of them
 MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
 
@@ -304,13 +305,10 @@ def _decimals(recording: Recording) -> tuple[int, ...]:
     decimals = []
     for sensor in SENSORS:
         reading = recording.reading(sensor)
-        part = np.zeros(0) if reading is None else reading[:OF_DECIMALS][np.isfinite(reading[:OF_DECIMALS]).all(axis=1)]
-        exact = (
-            d
-            for d in range(1, MAX_SIGNIFICANT_DIGITS)
-            if part.size and np.all(np.abs(part - np.round(part, d)) < 10.0**-MAX_SIGNIFICANT_DIGITS)
-        )
-        decimals.append(next(exact, MAX_SIGNIFICANT_DIGITS))
+        part = np.zeros((0, 3)) if reading is None else reading[:OF_DECIMALS]
+        part = part[np.isfinite(part).all(axis=1)]
+        exact = np.all(np.abs(part - np.rint(part * TENFOLD) / TENFOLD) < 10.0**-MAX_SIGNIFICANT_DIGITS, axis=(1, 2))
+        decimals.append(1 + int(np.argmax(np.append(exact, True))) if part.size else MAX_SIGNIFICANT_DIGITS)
     return tuple(decimals)
 
 
@@ -318,14 +316,14 @@ def _check_at(recordings: Sequence[Recording], decimals: Sequence[int]) -> None:
     """Refuse two recordings with the same samples, rounded to the decimals of each sensor."""
     keys = [_keys(r, decimals) for r in recordings]
     value = np.concatenate(keys)
+    known = np.sort(value)  # faster than the order of equal rows
+    if np.count_nonzero(known[1:] == known[:-1]) < MIN_STEP_ROWS - 1:
+        return
     owner = np.repeat(np.arange(len(keys)), [len(k) for k in keys])
     row = np.concatenate([np.arange(len(k)) for k in keys])
     order = np.argsort(value, kind="stable")  # equal rows next to each other, in the order of recordings
     value, owner, row = value[order], owner[order], row[order]
-    same = value[1:] == value[:-1]
-    if np.count_nonzero(same) < MIN_STEP_ROWS - 1:
-        return
-    within = same & (owner[1:] == owner[:-1])
+    within = (value[1:] == value[:-1]) & (owner[1:] == owner[:-1])
     single = ~(np.append(within, False) | np.append(False, within))  # rows that occur once in their recording
     value, owner, row = value[single], owner[single], row[single]
     for step in range(1, len(keys)):  # a row may be in several recordings: a pair of it is up to n - 1 places apart

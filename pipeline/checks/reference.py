@@ -125,7 +125,13 @@ class ChannelComparison:
         if not others or claim.name in OF_SENSOR:
             return None
         alone = all(w.name in OF_SENSOR for w in others)
-        gross, doubt = zip(*(self._rows(claim, w, alone=alone) for w in others), strict=True)
+        gross: list[Values] = []
+        doubt: list[Values] = []
+        for w in others:
+            for kind, excess in zip((gross, doubt), self._rows(claim, w, alone=alone), strict=True):
+                kind.append(excess)
+            if not np.any(np.min(doubt, axis=0) > 0.0):
+                break  # nor is anything gross: effects allow at least what the stated accuracy allows
         contradiction = self._worst_row(claim, others, gross) or self._worst_stretch(claim, others)
         found = contradiction or self._worst_row(claim, others, doubt)
         if not found:
@@ -183,7 +189,7 @@ class ChannelComparison:
             starts = np.arange(0, max(n - size // 2, 1), size)
             turned, total, bends, _ = self._sums(claim, size, starts)
             length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)
-            excess, sums = [], []
+            excess, sums, off = [], [], np.full(len(starts), np.inf)
             for other in others:
                 shown, shown_total, shown_bends, swing = self._sums(other, size, starts)
                 most = np.maximum(total, shown_total)
@@ -196,7 +202,9 @@ class ChannelComparison:
                     allowed += share * most + limits.late_s * swing + limits.offset_dps * length + noise
                 excess.append(np.abs(turned - shown) - allowed)
                 sums.append(shown)
-            off = np.min(excess, axis=0)
+                off = np.minimum(off, excess[-1])
+                if not np.any(off > 0.0):
+                    break
             rows = np.flatnonzero(off > 0.0)
             if rows.size:
                 worst = int(np.argmax(off))

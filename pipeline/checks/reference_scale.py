@@ -93,7 +93,7 @@ GRAVITY_TURNS = ("gravity's direction", 1e-2)  # relative: clocks without quartz
 SAME_ANGLE = 2e-4  # relative: 0.07 deg in a turn, error of gravity's direction by an accelerometer's nonlinearities
 # samples; blocks of a sandwich estimate; Gauss-Newton steps
 FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, GEAR_ITERATIONS = 200, 24, 4
-SURELY = 0.5  # share of what is allowed: further steps change the first by a tenth at most
+SURELY = 0.9  # share of what is allowed: further steps change the first by a tenth at most
 CONVERGED = 1e-12  # relative step, far below the uncertainty of any ratio
 SHARES = np.arange(1, BLOCKS_OF_A_GEAR) / BLOCKS_OF_A_GEAR
 UNIT_FACTOR_TOLERANCE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
@@ -122,17 +122,19 @@ def check_scale_of_turn(recording: Recording, limits: ChannelLimits) -> None:
 
     A turn about another axis than the stated one is not compared: the check of the mounting follows.
     """
-    turned = _turned(recording)
-    if turned is None:
+    found = {c.name: _in_blocks(c.turned) for c in of_table(recording)}
+    angle, rate = found.get("table_angle"), found.get("table_rate")
+    ratio = _ratio(rate, angle)
+    if ratio is not None and (not ratio.off(limits.rate) or not ratio.even):
         return
-    angle, rate, gyro, gravity = turned
-    true_angle, true_rate = _ratio(angle, gravity), _ratio(rate, gravity)
-    ratio, by_gyro = _ratio(rate, angle), _ratio(rate, gyro)
+    sensors = _turned(recording)
+    if sensors is None:
+        return
+    gyro, gravity = sensors
+    true_angle, true_rate, by_gyro = _ratio(angle, gravity), _ratio(rate, gravity), _ratio(rate, gyro)
     gyro_agrees = by_gyro is not None and by_gyro.agrees(GRAVITY_TOLERANCE)
     tolerance = limits.rate + GRAVITY_TOLERANCE
     if ratio is not None:
-        if not ratio.off(limits.rate) or not ratio.even:
-            return
         angle_wrong = ratio.value > 1.0 and gyro_agrees and not ratio.of_time
         if true_angle is not None and true_rate is not None:
             angle_wrong = abs(true_rate.value - 1.0) < abs(true_angle.value - 1.0)
@@ -149,8 +151,8 @@ def check_scale_of_turn(recording: Recording, limits: ChannelLimits) -> None:
             raise _wrong_time(recording, limits, factor, "the gyroscope's readings sum up to")
 
 
-def _turned(recording: Recording) -> tuple[Values | None, ...] | None:
-    """Return the angle turned in each block by angle, rate, gyroscope and gravity: (96,) arrays, deg.
+def _turned(recording: Recording) -> tuple[Values | None, Values | None] | None:
+    """Return the angle turned in each block by gyroscope and gravity: (96,) arrays, deg.
 
     None for a turn about another axis than the stated one.
     """
@@ -159,14 +161,12 @@ def _turned(recording: Recording) -> tuple[Values | None, ...] | None:
         spread = np.std(recording.gyroscope[recording.valid], axis=0)
         if spread[axis] < OTHER_AXIS * spread.max():
             return None
-    found = {c.name: c.turned for c in of_table(recording)}
     if recording.gyroscope is not None:
         reading = still = recording.gyroscope[:, axis]
         if recording.table_rate is not None:
             still = reading[np.abs(recording.table_rate) <= np.min(np.abs(recording.table_rate))]
         gyro = of_rate(recording, "gyroscope", reading - np.median(still), recording.valid).turned
-    channels = (found.get("table_angle"), found.get("table_rate"), gyro, gravity_turned(recording))
-    return tuple(map(_in_blocks, channels))
+    return _in_blocks(gyro), _in_blocks(gravity_turned(recording))
 
 
 def check_scale_of_motion(recording: Recording, size: Values | None, limits: ChannelLimits) -> None:
@@ -215,7 +215,8 @@ def doubt_of_angle(recording: Recording, limits: ChannelLimits) -> str | None:
 def _gear(recording: Recording, allowed: float) -> tuple[float, float] | None:
     """Return the ratio of the table's angle to gravity's, and its standard uncertainty.
 
-    None if it is unknown, or if the first step shows that it differs from 1 by less than is ``allowed``.
+    None if it is unknown, or if the first step shows that it differs from 1 by less than is ``allowed`` or significant.
+    Further steps change the first by a tenth at most, and the uncertainty is at least that of independent errors.
     """
     angle, rate, force = recording.table_angle, recording.logged_rate, recording.accelerometer
     if recording.role != "gyroscope":  # in a turn of minutes, a bias that follows the temperature has the same signal
@@ -226,34 +227,34 @@ def _gear(recording: Recording, allowed: float) -> tuple[float, float] | None:
     if np.count_nonzero(keep) < FEWEST_OF_A_GEAR or float(np.ptp(angle[keep])) < WHOLE_TURN_DEG:
         return None
     axis, w, t = axis_index(recording), np.radians(rate[keep]), recording.time[keep]
-    y = force[keep][:, [(axis + 1) % 3, (axis + 2) % 3]]
+    y = force[keep].T[[(axis + 1) % 3, (axis + 2) % 3]]
     a = logged = np.radians(angle[keep] - float(np.mean(angle[keep])))
     slope, late = np.gradient(w, t), (t - t[0]) / (t[-1] - t[0])
     for iteration in range(GEAR_ITERATIONS):
         c, s = np.cos(a), np.sin(a)
+        c2, s2 = c * c - s * s, 2.0 * c * s  # of the double angle
         columns = [np.ones_like(a), c, s, w * c, w * s, w * w, slope, late, late * late]
-        columns += [f(k * a) for k in (2, 3) for f in (np.cos, np.sin)]
-        Q, R = np.linalg.qr(np.column_stack(columns))
-        first = np.linalg.solve(R[:3, :3], Q[:, :3].T @ y)
-        d, e = a[:, None] * (np.outer(c, first[2]) - np.outer(s, first[1])), y.copy()
-        for k in range(2):
-            harmonic = first[1, k] * c + first[2, k] * s
-            drifts = np.column_stack([late * harmonic, late * late * harmonic])
-            every = np.column_stack([Q, np.linalg.qr(drifts - Q @ (Q.T @ drifts))[0]])
-            d[:, k] -= every @ (every.T @ d[:, k])
-            e[:, k] -= every @ (every.T @ e[:, k])
+        columns += [c2, s2, c2 * c - s2 * s, s2 * c + c2 * s]
+        Q, R = np.linalg.qr(np.stack(columns, axis=1))
+        _, cosine, sine = np.linalg.solve(R[:3, :3], Q[:, :3].T @ y.T)[..., None]
+        drifts = np.stack([late, late * late], axis=1) * (cosine * c + sine * s)[..., None]
+        own = np.linalg.qr(drifts - Q @ (Q.T @ drifts))[0]
+        both = np.stack([a * (sine * c - cosine * s), y], axis=2)
+        both -= Q @ (Q.T @ both)
+        d, e = np.moveaxis(both - own @ (np.swapaxes(own, 1, 2) @ both), 2, 0)
         information = float(np.sum(d * d))
         step = float(np.sum(d * e)) / information
-        if iteration == 0 and abs(step) <= SURELY * allowed:
+        white = float(np.sqrt(max(np.mean(e * e) - step * step * information / e.size, 0.0) / information))
+        if iteration == 0 and abs(step) <= SURELY * (allowed + SIGNIFICANT_UNCERTAINTIES * white):
             return None
         a = a * (1.0 + step)
         if abs(step) < CONVERGED:
             break
     # blocks of equal information: a turn may be a small part of the samples
-    ends = np.searchsorted(np.cumsum(np.sum(d * d, axis=1)) / information, SHARES)
-    scores = np.add.reduceat(np.sum(d * e, axis=1), np.unique([0, *ends]))
-    white = float(np.sqrt(np.mean(e * e) * information))  # of independent errors: the scores of few blocks may cancel
-    return float(logged @ logged / (a @ logged)), max(float(np.linalg.norm(scores)), white) / information
+    ends = np.searchsorted(np.cumsum(np.sum(d * d, axis=0)) / information, SHARES)
+    scores = np.add.reduceat(np.sum(d * e, axis=0), np.unique([0, *ends]))
+    # or of independent errors: the scores of few blocks may cancel
+    return float(logged @ logged / (a @ logged)), max(float(np.linalg.norm(scores)) / information, white)
 
 
 def doubt_of_scale(recording: Recording, limits: ChannelLimits) -> str | None:

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.checks.bench import UP_AT_QUARTER_TURN, angle_ahead, by_convention, unit
-from pipeline.core.records import AFTER_BASE, AXES, BASE_COUNT, MATRIX_NAMES, Note, motion_at_rest
+from pipeline.core.records import AFTER_BASE, AXES, BASE_COUNT, MATRIX_NAMES, Note, cross, motion_at_rest
 from pipeline.physics.effects import effect
 from pipeline.physics.kinematics import UP_AT_ZERO, level_at_zero, skew, turn_about_axis, turn_by_vector
 
@@ -95,7 +95,7 @@ class _Conventional:
 
     def normal(self, K: Values) -> Values:
         """Return the turn axis in the frame of K, ``K^T (q x p)`` with length 1: (3,) array."""
-        return unit(K.T @ np.cross(self.gravity.sine, self.gravity.cosine))
+        return unit(K.T @ cross(self.gravity.sine, self.gravity.cosine))
 
 
 @dataclass(frozen=True)
@@ -112,15 +112,14 @@ def _find_seats(turns: Sequence[_Conventional]) -> _Seats:
     n = len(turns)
     seats, K = np.zeros((n, 3)), np.eye(3)
     gauge = GAUGE * np.eye(9 + seats.size)[9:]
+    ideal, found = (np.array(v) for v in ([t.ideal for t in turns], [t.gravity[1:] for t in turns]))
     for _ in range(4):
-        R = turn_by_vector(np.radians(seats))
-        design, residual = np.zeros((n, 2, 3, 9 + seats.size)), np.zeros((n, 2, 3))
-        for k, turn in enumerate(turns):
-            for row, ideal in enumerate(turn.ideal):
-                d = R[k].T @ ideal
-                design[k, row, :, :9] = np.kron(np.eye(3), d)
-                design[k, row, :, 9 + 3 * k : 12 + 3 * k] = np.radians(K @ skew(d))
-                residual[k, row] = turn.gravity[1 + row] - K @ d
+        d = ideal @ turn_by_vector(np.radians(seats))
+        of_seats = np.zeros((n, 2, 3, n, 3))
+        of_seats[range(n), :, :, range(n)] = np.radians(K @ skew(d))
+        of_K = np.eye(3)[:, :, None] * d[:, :, None, None]
+        design = np.concatenate([of_K.reshape(n, 2, 3, 9), of_seats.reshape(n, 2, 3, 3 * n)], axis=3)
+        residual = found - d @ K.T
         rows = np.vstack([design.reshape(6 * n, -1), gauge])
         step = np.linalg.lstsq(rows, np.append(residual, -GAUGE * seats), rcond=None)[0]
         K, seats = K + step[:9].reshape(3, 3), seats + step[9:].reshape(-1, 3)
@@ -219,8 +218,8 @@ def seat_notes(turns: Sequence[TurnRecording], table: Table, sensor: Sensor) -> 
             # Against the body axis, or the axis of another turn about it, whichever is nearer: if the table's axes
             # lean, the turns for the gyroscope lean with those for the accelerometer.
             alike = [] if doubt else [slower.normal(found.K) for slower in slow if slower.axis == fast.axis]
-            rotations = [np.degrees(np.cross(fast.normal(found.K), a)) for a in (np.eye(3)[fast.axis], *alike)]
-            off = min(rotations, key=lambda v: float(np.linalg.norm(v)))
+            rotations = np.degrees(cross(fast.normal(found.K), np.array([np.eye(3)[fast.axis], *alike])))
+            off = min(rotations, key=lambda v: float(v @ v))
             if fast.turn.recording.role == "gyroscope" and np.max(np.abs(off)) > allowed:
                 details[fast.turn.name] = (
                     f"the mounting of the unit in {fast.turn.name} differs from that in the turns for the "

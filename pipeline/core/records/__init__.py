@@ -92,6 +92,7 @@ from pipeline.core.records.recording import (
     WanderLikelihood,
     conjugate_product,
     continuous,
+    cross,
     files_of_readings,
     level_in_body,
     median,
@@ -99,6 +100,7 @@ from pipeline.core.records.recording import (
     noise_of_steps,
     once,
     once_of_log,
+    quantile,
     rate_of_attitude,
 )
 
@@ -115,6 +117,6 @@ __all__ = [
     "SensorDiagnosis", "SensorValidation", "StageDetails", "StageResult", "StepErrors", "Subtract", "TableEvidence",
     "TemperatureBin", "TurnAngle", "TurnAxes", "TwoSided", "UnitRecordings", "Validation", "Values", "Wander",
     "WanderLikelihood", "base_units", "base_values", "calibrated", "conjugate_product", "continuous", "corrected",
-    "coverage_factor", "files_of_readings", "finite", "fit_from_json", "level_in_body", "matrix_of", "median",
-    "motion_at_rest", "noise_of_steps", "once", "once_of_log", "rate_of_attitude", "standard_uncertainty",
+    "coverage_factor", "cross", "files_of_readings", "finite", "fit_from_json", "level_in_body", "matrix_of", "median",
+    "motion_at_rest", "noise_of_steps", "once", "once_of_log", "quantile", "rate_of_attitude", "standard_uncertainty",
 ]  # fmt: skip

@@ -45,7 +45,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.records import MEDIAN_SIZE, Mask, Recording, Values, median, noise_of_steps, once
+from pipeline.core.records import MEDIAN_SIZE, Mask, Recording, Values, median, noise_of_steps, once, quantile
 from pipeline.physics.signal.filters import filter_autocovariance, variance_of_mean
 
 if TYPE_CHECKING:
@@ -231,7 +231,7 @@ def counts_of(differences: Values) -> Values:
 
     In coarse readings it is one count; in fine ones it is negligible against their noise.
     """
-    smallest = np.min(differences, axis=0, where=differences > 0.0, initial=np.inf)
+    smallest = np.where(differences > 0.0, differences, np.inf).min(axis=0, initial=np.inf)
     return np.asarray(np.where(np.isfinite(smallest), smallest, 0.0))
 
 
@@ -249,7 +249,7 @@ def step_and_noise(recording: Recording, sensor: str) -> tuple[Values, Values]:
         return unknown, unknown
     step = counts_of(differences)
     blocks = differences[: count * DIFFERENCE_BLOCK].reshape(count, DIFFERENCE_BLOCK, 3)
-    noise = np.sqrt(0.5 * np.percentile(np.mean(blocks**2, axis=1), 25.0, axis=0))
+    noise = np.sqrt(0.5 * quantile(np.mean(blocks**2, axis=1), 0.25))
     return np.where(step > 0.0, step, np.inf), noise
 
 
