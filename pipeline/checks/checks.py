@@ -39,7 +39,7 @@ from pipeline.checks.reference import check_motion, check_turns
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Note
 from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.physics.kinematics import normal_gravity_g
-from pipeline.physics.signal.quiet_motion import rounding_of, step_and_noise
+from pipeline.physics.signal.quiet_motion import rounding_of_readings
 from pipeline.physics.signal.rests import settling_of
 
 if TYPE_CHECKING:
@@ -219,8 +219,7 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
     """Note the axes whose readings have steps that hide their noise, with step and decimals (``N-RESOLUTION``)."""
     noted = list(recordings)
     for sensor in SENSORS:
-        own = [k for k, r in enumerate(recordings) if r.reading(sensor) is not None]
-        steps, rounding = rounding_of([step_and_noise(recordings[k], sensor) for k in own])
+        steps, rounding = rounding_of_readings(recordings, sensor)
         for step in np.unique(steps[steps > 0.0]):
             off = np.sqrt(3.0) * rounding[steps == step].max()  # half-width of a rectangle
             axes = ", ".join(name for name, s in zip(TRIADS[sensor], steps, strict=True) if s == step)
@@ -234,8 +233,8 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
                 "recording, and effects of this size cannot be distinguished from rounding. Log more digits, or set a "
                 "smaller range"
             )
-            first = noted[own[0]]
-            noted[own[0]] = replace(first, notes=(*first.notes, Note(RESOLUTION_NOTE, first.samples, 0, 0, detail)))
+            k, first = next((k, r) for k, r in enumerate(noted) if r.reading(sensor) is not None)
+            noted[k] = replace(first, notes=(*first.notes, Note(RESOLUTION_NOTE, first.samples, 0, 0, detail)))
     return noted
 
 

@@ -134,12 +134,15 @@ def of_table(recording: Recording) -> tuple[Channel, ...]:
     if turns and angle is not None:
         channels.append(_of_turned("table_angle", recording, np.diff(angle)))
     if not turns and attitude is not None:
-        channels.append(_of_turned("table_attitude", recording, np.linalg.norm(spin(attitude), axis=1)))
+        channels.append(_of_turned("table_attitude", recording, np.linalg.norm(spin(recording), axis=1)))
     return tuple(channels)
 
 
-def spin(attitude: Values) -> Values:
-    """Return the rotation vector, in the body, from each attitude to the next: (n - 1, 3) array, deg."""
+@once_of_log
+def spin(recording: Recording) -> Values:
+    """Return the rotation vector, in the body, from each logged attitude to the next: (n - 1, 3) array, deg."""
+    attitude = recording.table_attitude
+    assert attitude is not None  # noqa: S101
     q = continuous(attitude)
     sine = conjugate_product(q[:-1], q[1:])
     size = np.linalg.norm(sine, axis=1, keepdims=True)
@@ -201,8 +204,8 @@ def of_gravity(recording: Recording, turned: Values, channels: Sequence[Channel]
     return replace(_of_turned("gravity", recording, sign * turned), noise=noise)
 
 
-def ratio_quartiles(one: Values, other: Values, cut: int, least: float) -> Values:
-    """Return the weighted quartiles of the ratios of (n,) or (n, k) values to a channel: (3,) or (3, k) array.
+def ratio_quantiles(one: Values, other: Values, cut: int, least: float, *shares: float) -> Values:
+    """Return weighted quantiles of the ratios of (n,) or (n, k) values to a channel: (q,) or (q, k) array.
 
     The weights ``|other|`` are cut off at their (1 / cut) largest value; ratios below ``least`` of that are left out.
     """
@@ -212,7 +215,7 @@ def ratio_quartiles(one: Values, other: Values, cut: int, least: float) -> Value
     weight, ratio = np.minimum(size[used], largest), (one[used].T / other[used]).T
     order = np.argsort(ratio, axis=0)
     total = np.cumsum(weight[order], axis=0) / weight.sum()
-    places = np.stack([np.count_nonzero(total < share, axis=0) for share in (0.25, 0.5, 0.75)])
+    places = np.stack([np.count_nonzero(total < share, axis=0) for share in shares])
     return np.take_along_axis(ratio, np.take_along_axis(order, places, axis=0), axis=0)
 
 

@@ -57,7 +57,7 @@ from pipeline.checks.evidence import (
     of_table,
     place,
     quantiles,
-    ratio_quartiles,
+    ratio_quantiles,
     refusal,
     spin,
 )
@@ -335,13 +335,13 @@ class _Gyroscope:
                 turned = int(np.argmax(np.abs(gain)))  # not the stated axis: the mounting is checked later
                 found.append((turned, float(quantiles(np.abs(rate), 0.9)[0]), gain, bias))
         gains = [abs(gain[axis]) for axis, _, gain, _ in found]
-        self.usual = float(np.median(gains)) if len(gains) > 2 else 1.0
+        self.usual = float(median(np.array(gains))) if len(gains) > 2 else 1.0
         self.matrix = self.usual * np.eye(3)
         for axis in range(3):
             fitting = [f for f in found if f[0] == axis and abs(abs(f[2][axis]) / self.usual - 1.0) <= SAME_GAIN]
             if fitting:
                 self.matrix[:, axis] = max(fitting, key=lambda f: f[1])[2]
-        self.bias = np.median([bias for *_, bias in found], axis=0) if found else None
+        self.bias = median(np.array([bias for *_, bias in found])) if found else None
 
     def along(self, recording: Recording, axis: int) -> Values | None:
         """Return the rate about a turn axis with the bias of this recording: (n,) array, deg/s."""
@@ -373,7 +373,7 @@ def _slopes(recording: Recording) -> Values:
     change = rate - median(rate)
     if largest_but(np.abs(change), 100) < LEAST_RATE_DPS:
         return np.zeros((2, 3))
-    gain = ratio_quartiles(reading - median(reading), change, 100, 0.1)[1]
+    gain = ratio_quantiles(reading - median(reading), change, 100, 0.1, 0.5)[0]
     return np.stack([gain, median(reading - gain * rate[:, None])])
 
 
@@ -408,7 +408,7 @@ def _check_motion(
         channels.append(of_rate(recording, "gyroscope", size, recording.valid))
     found = _compare(recording, channels, limits)
     if vector is not None and recording.table_attitude is not None:
-        _check_directions(recording, recording.table_attitude, vector, limits)
+        _check_directions(recording, vector, limits)
     return found
 
 
@@ -435,25 +435,25 @@ def _check_attitude_of_turn(recording: Recording, limits: ChannelLimits) -> None
     """Compare the attitude of a turn without angle and rate with the gyroscope, whose bias is its median at rest."""
     if recording.table_attitude is None or recording.gyroscope is None:
         return
-    speed = np.linalg.norm(spin(recording.table_attitude), axis=1) / np.diff(recording.time)
+    speed = np.linalg.norm(spin(recording), axis=1) / np.diff(recording.time)
     fastest = float(quantiles(speed, 0.99)[0])
     moving, resting = speed > MIN_SHARE_OF_USUAL_GAIN * fastest, speed < RESTING_RATE_SHARE * fastest
     if min(np.count_nonzero(moving), np.count_nonzero(resting)) >= MIN_REFERENCE_SAMPLES:
         vector = recording.gyroscope - median(recording.gyroscope[1:][resting])
-        _check_directions(recording, recording.table_attitude, vector, limits, moving)
+        _check_directions(recording, vector, limits, moving)
 
 
 def _check_directions(
-    recording: Recording, attitude: Values, vector: Values, limits: ChannelLimits, where: Mask | slice = slice(None)
+    recording: Recording, vector: Values, limits: ChannelLimits, where: Mask | slice = slice(None)
 ) -> None:
     """Refuse an attitude whose rotation has another direction in the body than the gyroscope's."""
-    logged = (spin(attitude) / np.diff(recording.time)[:, None])[where]
+    logged = (spin(recording) / np.diff(recording.time)[:, None])[where]
     measured = 0.5 * (vector[1:] + vector[:-1])[where]
     off, size = np.linalg.norm(logged - measured, axis=1), np.linalg.norm(measured, axis=1)
     change = np.linalg.norm(np.diff(vector, axis=0), axis=1)[where] / recording.interval
     allowed = (limits.gain + limits.rate) * size + limits.late_s * change + limits.offset_dps
-    usual_off, usual_size = float(np.median(off)), float(np.median(size))
-    if usual_off > float(np.median(allowed)) + 0.5 * usual_size:
+    usual_off, usual_size = float(median(off)), float(median(size))
+    if usual_off > float(median(allowed)) + 0.5 * usual_size:
         raise refusal(
             recording,
             "reference_contradiction",

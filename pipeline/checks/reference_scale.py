@@ -40,7 +40,7 @@ from pipeline.checks.evidence import (
     of_rate,
     of_table,
     place,
-    ratio_quartiles,
+    ratio_quantiles,
     refusal,
 )
 from pipeline.core.records import MEDIAN_SIZE
@@ -356,7 +356,7 @@ def _ratio(one: Values | None, other: Values | None) -> _Ratio | None:
     size = np.abs(other)
     if not float(np.sum(np.minimum(size, largest_but(size, 10)))) > LEAST_TOTAL_DEG:
         return None
-    low, middle, high = np.abs(ratio_quartiles(one, other, 10, 0.3))
+    low, middle, high = np.abs(ratio_quantiles(one, other, 10, 0.3, 0.25, 0.5, 0.75))
     return _Ratio(float(middle), bool(middle > 0.0 and abs(high - low) <= MAX_RATIO_SPREAD * middle))
 
 

@@ -77,7 +77,7 @@ from pipeline.estimation.gauss_markov import (
     variance_of_average,
 )
 from pipeline.physics.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
-from pipeline.physics.signal.quiet_motion import component_along_gravity, creep_of_readings, rounding_of, step_and_noise
+from pipeline.physics.signal.quiet_motion import component_along_gravity, creep_of_readings, rounding_of_readings
 from pipeline.physics.signal.rests import rest_readings, stretches_of, usable
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def estimate_noise(sensor: str, recordings: Sequence[Recording], data_sheet: Dat
 
 def _not_below_rounding(noise: Noise, sensor: str, recordings: Sequence[Recording], data_sheet: DataSheet) -> Noise:
     """Return the noise with at least the rounding error of coarse readings as white noise."""
-    steps, rounding = rounding_of([step_and_noise(r, sensor) for r in recordings if r.reading(sensor) is not None])
+    steps, rounding = rounding_of_readings(recordings, sensor)
     constant = noise.white <= SMALLEST_WHITE
     if not np.any(constant | (steps > 0.0)):
         return noise

@@ -25,7 +25,7 @@ from pipeline.physics.signal.filters import (
     temperature_rate_of,
     variance_of_mean,
 )
-from pipeline.physics.signal.quiet_motion import creep_of_rest, posterior_creep_rates, rounding_of, step_and_noise
+from pipeline.physics.signal.quiet_motion import creep_of_rest, posterior_creep_rates, rounding_of_readings
 from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, usable
 
 if TYPE_CHECKING:
@@ -302,7 +302,7 @@ def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, 
     parts = {index: _of_recording(recordings[index], sensor, tuple(rests)) for index, rests in chosen.items()}
     columns = {name: np.concatenate([part[name] for part in parts.values()]) for name in next(iter(parts.values()))}
     columns["recording"] = np.repeat([*parts], [len(part["time"]) for part in parts.values()])
-    _, rounding = rounding_of([step_and_noise(r, sensor) for r in recordings if r.reading(sensor) is not None])
+    _, rounding = rounding_of_readings(recordings, sensor)
     columns["rounding"] = np.tile(rounding, (len(columns["time"]), 1))
     shared = len(np.unique(columns["recording"])) == 1 or all(recordings[index].clock_shared for index in chosen)
     used = [recordings[index] for index in chosen]

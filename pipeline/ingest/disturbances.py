@@ -319,12 +319,15 @@ def _excess(reading: Values, pieces: Index) -> tuple[Values, Values]:
     centred = np.append(reading - reading.mean(axis=0), np.zeros((1, 3)), axis=0)
     sums, squares = (np.add.reduceat(v, bounds, axis=0)[::2] for v in (centred, centred**2))
     about_mean = np.maximum(squares - sums**2 / count[:, None], 0.0)
-    step = np.abs(np.diff(reading, axis=0))
-    rounding = np.where(step > 0.0, step, np.inf).min(axis=0) ** 2 / 4.0  # between two counts
-    usual = np.maximum(median(about_mean / (count - 1.0)[:, None]), rounding)
-    chi = np.sum(about_mean / usual, axis=1)
     freedom = 3.0 * (count - 1.0)
     most = np.maximum(RATIO * freedom, freedom + SIGNIFICANT_DEVIATIONS * np.sqrt(2.0 * freedom) + CHI_SQUARE_TAIL)
+    usual = median(about_mean / (count - 1.0)[:, None])
+    if usual.all() and np.all((chi := np.sum(about_mean / usual, axis=1)) <= most):
+        return np.zeros(len(chi)), np.sqrt(chi / freedom)  # rounding makes the usual scatter larger
+    step = np.abs(np.diff(reading, axis=0))
+    rounding = np.where(step > 0.0, step, np.inf).min(axis=0) ** 2 / 4.0  # between two counts
+    usual = np.maximum(usual, rounding)
+    chi = np.sum(about_mean / usual, axis=1)
     for piece in np.flatnonzero(chi > most):
         start, stop = pieces[piece]
         own = reading[start:stop]

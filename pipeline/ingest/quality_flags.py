@@ -19,7 +19,7 @@ import numpy as np
 from imu_logs.clocks import bursts_error, rounded_error
 from imu_logs.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TABLE_CHANNELS, TRIADS
 from pipeline.core.errors import IngestError
-from pipeline.core.records import SENSOR_UNITS
+from pipeline.core.records import SENSOR_UNITS, median
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -62,7 +62,7 @@ _OTHER_FACTORS = {
 def flag_gaps(table: Log, flags: NDArray[np.uint16], checks: Checks) -> list[Note]:
     """Flag gaps, and note irregular intervals; raise ``IngestError`` beyond ``checks.missing_time`` of missing time."""
     steps = np.diff(table.time_ns)
-    usual = float(np.median(steps))
+    usual = float(median(steps))
     limit = GAP_INTERVALS * usual
     if int(steps.max()) <= limit:
         return _irregular(table, steps, usual)
@@ -271,7 +271,7 @@ def _stuck_rows(same: Mask, share: float) -> Index:
 def _in_a_row(same: Mask, count: int) -> bool:
     """Return whether ``count`` successive neighbours are equal."""
     places, further = np.flatnonzero(same), count - 1
-    return bool(np.any(places[further:] - places[: max(len(places) - further, 0)] == further))
+    return len(places) > further and bool(np.any(places[further:] - places[: len(places) - further] == further))
 
 
 def examine(table: Log, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[np.uint16] | None, list[Note]]:
@@ -326,7 +326,7 @@ def _check_force(table: Log) -> None:
         return
     stride = -(-len(table.time_ns) // MEDIAN_SAMPLES)
     squares = np.asarray(sum(table.values[c][::stride] ** 2 for c in TRIADS["accelerometer"]))
-    usual = float(np.sqrt(np.median(squares)))
+    usual = float(np.sqrt(median(squares)))
     low, high = FORCE_RANGE_G
     if low <= usual <= high:
         return
@@ -368,7 +368,7 @@ def _check_turn_rate(table: Log) -> None:
         if turning.sum() < 20:
             return
         size = np.sqrt(sum(table.values[c][::stride][turning] ** 2 for c in TRIADS["gyroscope"]))
-        ratio = float(np.median(size / rate[turning]))
+        ratio = float(median(size / rate[turning]))
         seen = f"while the table turns the angular rate is {ratio:.3g} times the table's"
     else:
         from pipeline.ingest.axis_maps import declared_scale  # noqa: PLC0415  (imported where there is no table)

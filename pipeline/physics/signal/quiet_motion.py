@@ -66,6 +66,7 @@ TREMOR_LIMIT_DPS = 2.5
 SAME_DEG = 2.0  # the limit of a rest in ``pipeline.physics.signal.rests``
 ROUNDING_TERMS = 1000  # harmonics, with which u^2 of readings without noise is 6e-4 too small
 COARSE = float(np.sqrt(0.25 + 1.0 / 12.0))  # steps, scatter of readings with noise of half a step
+OF_A_STEP = 256  # differences, in which readings finer than their noise show that
 DIFFERENCE_BLOCK, MIN_DIFFERENCE_BLOCKS = 16, 8  # differences of a block; blocks of a recording that show its noise
 DECIMAL_ROUNDING = 1e-6  # relative, of a difference of decimals
 
@@ -236,10 +237,10 @@ def counts_of(differences: Values) -> Values:
 
 
 @once
-def step_and_noise(recording: Recording, sensor: str) -> tuple[Values, Values]:
+def step_and_noise(recording: Recording, sensor: str, rows: int | None = None) -> tuple[Values, Values]:
     """Return the step and the noise of each axis of a sensor's readings; infinite where unknown.
 
-    The noise is the first quartile of the white noise of blocks, that of the quietest.
+    The noise is the first quartile of the white noise of blocks, that of the quietest. ``rows``: that show the step.
     """
     unknown = np.full(3, np.inf)
     values = np.asarray(recording.reading(sensor))
@@ -247,10 +248,20 @@ def step_and_noise(recording: Recording, sensor: str) -> tuple[Values, Values]:
     count = len(differences) // DIFFERENCE_BLOCK
     if count < MIN_DIFFERENCE_BLOCKS:
         return unknown, unknown
-    step = counts_of(differences)
+    step = counts_of(differences[:rows])
     blocks = differences[: count * DIFFERENCE_BLOCK].reshape(count, DIFFERENCE_BLOCK, 3)
     noise = np.sqrt(0.5 * quantile(np.mean(blocks**2, axis=1), 0.25))
     return np.where(step > 0.0, step, np.inf), noise
+
+
+def rounding_of_readings(recordings: Sequence[Recording], sensor: str) -> tuple[Values, Values]:
+    """Return ``rounding_of`` of recordings; the step of some rows, at least that of all, mostly excludes coarse."""
+    own = [r for r in recordings if r.reading(sensor) is not None]
+    parts = (step_and_noise(r, sensor, OF_A_STEP) for r in own)
+    least = [np.min(values, axis=0) for values in zip(*parts, strict=True)]
+    if least and np.all(COARSE * least[0] <= least[1]):
+        return np.zeros(3), np.zeros(3)
+    return rounding_of([step_and_noise(r, sensor) for r in own])
 
 
 def rounding_of(found: Sequence[tuple[Values, Values]]) -> tuple[Values, Values]:
