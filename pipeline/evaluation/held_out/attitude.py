@@ -34,6 +34,7 @@ from pipeline.core.records import (
     StageDetails,
     Values,
     continuous,
+    cross,
     level_in_body,
 )
 from pipeline.estimation.design import EffectColumns
@@ -104,7 +105,7 @@ def attitude(
             assert force is not None  # noqa: S101
             steps, fused = _fuse(time, force, alone)
             up, true_up = level_in_body(fused), level_in_body(reference[:, steps].T)
-            sine, cosine = np.linalg.norm(np.cross(up, true_up), axis=1), np.einsum("ij,ij->i", up, true_up)
+            sine, cosine = np.linalg.norm(cross(up, true_up), axis=1), np.sum(up * true_up, axis=1)
             tilt, since = np.degrees(np.arctan2(sine, cosine)), time[steps] - time[0]
             tilts[name] = float(np.sqrt(np.mean(tilt[since >= min(TILT_SETTLING_S, 0.5 * since[-1])] ** 2)))
             curve[f"tilt_{name}"] = _rounded(np.interp(time[shown] - time[0], since, tilt))
@@ -117,12 +118,12 @@ def integrate(time: Values, rate: Values, start: Values) -> Values:
     w, dt = np.radians(rate), np.diff(time)[:, None]
     mean = 0.5 * (w[:-1] + w[1:])
     mean[1:-1] += (w[1:-2] + w[2:-1] - w[:-3] - w[3:]) / 24.0
-    turns = (dt * mean + dt**2 / 12.0 * np.cross(w[:-1], w[1:])).T
+    turns = (dt * mean + dt**2 / 12.0 * cross(w[:-1], w[1:])).T
     half = 0.5 * np.linalg.norm(turns, axis=0)
     total, step = np.vstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * turns]), 1
     total = np.column_stack([start, total])
     while step < len(time):  # products of 2, 4, 8 ... neighbours: a running product in log2 n passes
-        total = np.hstack([total[:, :step], _product(total[:, :-step], total[:, step:])])
+        total[:, step:] = _product(total[:, :-step], total[:, step:])
         step *= 2
     return total
 
@@ -132,7 +133,7 @@ def _product(p: Values, q: Values) -> Values:
     a, b, c, d = p
     e, f, g, h = q
     rows = a * e - b * f - c * g - d * h, a * f + b * e + c * h - d * g, a * g - b * h + c * e + d * f
-    return np.stack([*rows, a * h + b * g - c * f + d * e])
+    return np.array([*rows, a * h + b * g - c * f + d * e])
 
 
 def drift(time: Values, estimate: Values, reference: Values, seconds: float) -> float:

@@ -339,7 +339,7 @@ def linearized(calibration: SensorCalibration, samples: Samples) -> LinearizedSa
         samples.white_variance[chosen],
         samples.wander_variance[chosen],
         truth,
-        np.nan_to_num(J),
+        J if np.isfinite(J).all() else np.nan_to_num(J),
         int(np.count_nonzero(samples.known)),
         samples.correlated_samples,
     )
@@ -477,7 +477,7 @@ def _form(
         W = _weights(M, each, covariance[:-1, :-1], drift + coarse)
         J = np.concatenate([each.derivative, -each.truth[:, :, None]], axis=2)
         WJ, MWM = W @ J, M.T @ W @ M
-        of_parameters += share / n * np.tensordot(J, WJ, ([0, 1], [0, 1]))
+        of_parameters += share / n * (J.reshape(-1, q).T @ WJ.reshape(-1, q))
         of_wander = np.add.reduceat(MWM, first, axis=0) * share / n
         across = np.swapaxes(np.add.reduceat(WJ, first, axis=0), 1, 2) @ M * share / n
         of_blocks.append((of_wander, across, B, block_covariance(start, length, drift_time)))
@@ -489,18 +489,16 @@ def _form(
         within = within + _traces_of(MWM * within_block[:, None, :]) * [share, share**2 * correlated]
     A, Q = np.zeros((size, size)), np.zeros((3, size, size))
     A[:q, :q], at = of_parameters, q
-    for of_wander, across, _, _ in of_blocks:
-        for form, mixed in zip(of_wander, across, strict=True):
-            block = slice(at, at + 3)
-            A[block, block], A[:q, block], A[block, :q] = form, mixed, mixed.T
-            at = block.stop
-    Q[0, :, :q], at = A[:, :q] @ covariance, q
-    for of_wander, _, B, slow in of_blocks:  # the blocks of a recording have the covariance in time, on each axis
-        blocks = slice(at, at + 3 * len(of_wander))
-        of_axes = A[:, blocks].reshape(size, -1, 3).swapaxes(1, 2)
+    for of_wander, across, B, slow in of_blocks:  # the blocks of a recording have the covariance in time, on each axis
+        count = len(of_wander)
+        blocks, own = slice(at, at + 3 * count), np.zeros((count, 3, count, 3))
+        own[range(count), :, range(count)] = of_wander
+        A[blocks, blocks], A[blocks, :q] = own.reshape(3 * count, -1), across.swapaxes(1, 2).reshape(-1, q)
+        A[:q, blocks], at = A[blocks, :q].T, blocks.stop
         for k, in_time, of_axis in ((1, B, noise.wander**2), (2, slow, drift)):
-            Q[k, :, blocks] = ((of_axes @ in_time).swapaxes(1, 2) * of_axis).reshape(size, -1)
-        at = blocks.stop
+            mixed = (in_time @ A[blocks].reshape(count, -1)).reshape(count, 3, size)
+            Q[k, :, blocks] = (mixed * of_axis[:, None]).reshape(-1, size).T
+    Q[0, :, :q] = A[:, :q] @ covariance
     transposed = np.swapaxes(Q, 1, 2).reshape(3, -1)
     determined = noise.length / interval if noise.length > 0.0 else REST_SAMPLES
     first_order, second_order = np.trace(Q, axis1=1, axis2=2), Q.reshape(3, -1) @ transposed.T
@@ -516,14 +514,14 @@ def _form(
 
 def _traces_of(Q: Values) -> Values:
     """Return the means of ``tr Q`` and ``tr Q^2`` over samples: (2,) array."""
-    return np.array([np.trace(Q, axis1=1, axis2=2).mean(), np.sum(Q * np.swapaxes(Q, 1, 2), axis=(1, 2)).mean()])
+    return np.array([np.einsum("nii->", Q), np.einsum("nij,nji->", Q, Q)]) / len(Q)
 
 
 def _weights(M: Values, each: LinearizedSamples, C: Values, slow: Values) -> Values:
     """Return W of each sample, (n, 3, 3); ``C``: covariance of the parameters, ``slow``: (3,), further variance."""
     J, noise = each.derivative, each.white_variance + each.wander_variance + slow
-    of_parameters = np.einsum("nip,pq,njq->ij", J, C, J, optimize=True) / len(J)
-    mean = np.einsum("ij,j,kj->ik", M, noise.mean(axis=0), M) + of_parameters
+    by_axis, of_axis = (v.swapaxes(0, 1).reshape(3, -1) for v in (J, (J.reshape(-1, len(C)) @ C).reshape(J.shape)))
+    mean = M * noise.mean(axis=0) @ M.T + of_axis @ by_axis.T / len(J)
     size = np.linalg.norm(each.truth, axis=1)
     u = each.truth / np.where(size > 0.0, size, 1.0)[:, None]
     g = mean_squares(each.truth, mean)[1][:, None, None]

@@ -345,7 +345,7 @@ def mean_squares(truth: Values, S: Values) -> tuple[Values, Values]:
     """Return ``E(|t + x| - |t|)^2`` and its weight g, for (n, 3) truths and errors x of covariance S: (n,) arrays."""
     size, total = np.linalg.norm(truth, axis=1), float(np.trace(S))
     u = truth / np.where(size > 0.0, size, 1.0)[:, None]
-    along = np.einsum("ni,ij,nj->n", u, S, u)
+    along = np.sum(u @ S * u, axis=1)
     squares, g = along.copy(), np.zeros(len(truth))
     near = (size <= LINEAR_FROM * np.sqrt(total)) & (total > 0.0)
     if near.any():

@@ -254,8 +254,9 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
         known = samples.known & np.isfinite(np.hstack([reading, truth])).all(axis=1)
         rows = np.isfinite(truth[samples.representative]).all(axis=1)
         columns = np.column_stack([np.ones(np.count_nonzero(rows)), truth[samples.representative][rows]])
-        per_parameter = np.einsum("jn,nip->ijp", np.linalg.pinv(columns)[1:], part.derivative[rows])
-        slopes += part.number * per_parameter.reshape(9, -1)
+        products = columns.T @ part.derivative[rows].reshape(len(columns), -1)
+        per_parameter = (np.linalg.pinv(columns.T @ columns, hermitian=True) @ products)[1:].reshape(3, 3, -1)
+        slopes += part.number * per_parameter.swapaxes(0, 1).reshape(9, -1)
         flags = np.zeros(len(known), np.uint16) if recording.flags is None else recording.flags
         values: dict[str, Any] = {"role": sensor, sensor: np.nan_to_num(reading)}
         calibrated.append(recording.with_readings(flags=np.where(known, flags, flags | STUCK), **values))
