@@ -352,7 +352,7 @@ def _check_spans(recording: Recording) -> None:
             stuck.append((TRIADS["gyroscope"][axis], spans[axis], f"{required:.3g} deg/s", "the rows"))
     angle = recording.table_angle
     if angle is None:
-        angle = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(recording.time))
+        angle = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * recording.time_steps)
     if recording.accelerometer is not None and np.ptp(angle) >= HALF_TURN_DEG:
         turns = np.abs(np.diff(angle, prepend=angle[0])) > RATE_AT_REST_DPS * recording.interval
         rows = turns if turns.sum() >= MIN_AXIS_SAMPLES else np.ones(len(angle), bool)  # rests may be most of the time

@@ -151,15 +151,14 @@ def spin(recording: Recording) -> Values:
 
 
 def _of_turned(name: str, recording: Recording, turned: Values) -> Channel:
-    rate = turned / np.diff(recording.time)
+    rate = turned / recording.time_steps
     lost = gaps(recording)
     return Channel(name, np.where(lost, -np.inf, rate), np.where(lost, np.inf, rate), np.where(lost, 0.0, turned), 0.0)
 
 
 def of_rate(recording: Recording, name: str, rate: Values, known: Mask | None = None) -> Channel:
     """Return the rotation by rates at the samples; an unknown rate contradicts nothing."""
-    dt = np.diff(recording.time)
-    turned = np.where(gaps(recording), 0.0, 0.5 * (rate[1:] + rate[:-1]) * dt)
+    turned = np.where(gaps(recording), 0.0, 0.5 * (rate[1:] + rate[:-1]) * recording.time_steps)
     low = high = rate
     if known is not None and not known.all():
         low, high = np.where(known, rate, -np.inf), np.where(known, rate, np.inf)

@@ -111,7 +111,7 @@ class ChannelComparison:
 
     def __init__(self, recording: Recording, channels: Sequence[Channel], limits: ChannelLimits) -> None:
         self.recording, self.channels, self.limits = recording, channels, limits
-        self.dt = np.diff(recording.time)
+        self.dt = recording.time_steps
         self.interval = float(median(self.dt))
         self._summed: dict[tuple[str, int], tuple[Values, Values, Values, Values]] = {}  # by channel and size
         self.known = np.ones(len(self.dt), bool)  # intervals in which every channel is known
@@ -435,7 +435,7 @@ def _check_attitude_of_turn(recording: Recording, limits: ChannelLimits) -> None
     """Compare the attitude of a turn without angle and rate with the gyroscope, whose bias is its median at rest."""
     if recording.table_attitude is None or recording.gyroscope is None:
         return
-    speed = np.linalg.norm(spin(recording), axis=1) / np.diff(recording.time)
+    speed = np.linalg.norm(spin(recording), axis=1) / recording.time_steps
     fastest = float(quantiles(speed, 0.99)[0])
     moving, resting = speed > MIN_SHARE_OF_USUAL_GAIN * fastest, speed < RESTING_RATE_SHARE * fastest
     if min(np.count_nonzero(moving), np.count_nonzero(resting)) >= MIN_REFERENCE_SAMPLES:
@@ -447,7 +447,7 @@ def _check_directions(
     recording: Recording, vector: Values, limits: ChannelLimits, where: Mask | slice = slice(None)
 ) -> None:
     """Refuse an attitude whose rotation has another direction in the body than the gyroscope's."""
-    logged = (spin(recording) / np.diff(recording.time)[:, None])[where]
+    logged = (spin(recording) / recording.time_steps[:, None])[where]
     measured = 0.5 * (vector[1:] + vector[:-1])[where]
     off, size = np.linalg.norm(logged - measured, axis=1), np.linalg.norm(measured, axis=1)
     change = np.linalg.norm(np.diff(vector, axis=0), axis=1)[where] / recording.interval

@@ -283,7 +283,7 @@ def rate_against_angle(recording: Recording) -> tuple[float, float, int] | None:
     rate = recording.table_rate
     if rate is None:
         return None
-    dt = np.diff(recording.time)
+    dt = recording.time_steps
     even = np.abs(np.diff(rate)) <= CONSTANT_RATE_CHANGE * np.abs(rate[1:])
     even &= (np.abs(rate[1:]) > LEAST_TOTAL_DEG) & ~gaps(recording)
     even[1:-1] &= even[2:] & even[:-2]  # two samples on either side of a short move's peak are equal by chance

@@ -154,7 +154,7 @@ class _StoredRecording(Recording):
     def channels(self, names: Sequence[str]) -> NDArray[Any] | None:
         """Return a channel, or a block of three or four; None if the file does not have it."""
         columns = vars(self)["stored"](names)
-        return None if columns is None else columns[0] if len(names) == 1 else np.array(columns).T
+        return None if columns is None else columns[0] if len(names) == 1 else np.column_stack(columns)
 
 
 for _name, _channels in {**BLOCKS, **{name: (name,) for name in SINGLES}}.items():

@@ -186,7 +186,7 @@ class _Motion:
             rate = np.zeros((recording.samples, 1))
         self.rate = rate
         self.still = STILL_BY_HAND_DEG if self.by_hand else STILL_DEG
-        dt = np.diff(recording.time)
+        dt = recording.time_steps
         turned = 0.5 * np.linalg.norm(rate[1:] + rate[:-1], axis=1) * dt
         changed = np.linalg.norm(np.diff(rate, axis=0), axis=1)
         speed = np.radians(np.linalg.norm(rate, axis=1))
@@ -200,12 +200,12 @@ class _Motion:
         r = self.recording
         if r.table_attitude is not None and np.isfinite(r.table_attitude).all():
             q = continuous(r.table_attitude)
-            rate = np.degrees(2.0 * conjugate_product(q[:-1], q[1:])) / np.diff(r.time)[:, None]
+            rate = np.degrees(2.0 * conjugate_product(q[:-1], q[1:])) / r.time_steps[:, None]
             return np.concatenate([rate, rate[-1:]])
         if r.table_rate is not None:
             return r.table_rate[:, None]
         if r.table_angle is not None:
-            rate = np.diff(r.table_angle) / np.diff(r.time)
+            rate = np.diff(r.table_angle) / r.time_steps
             return np.append(rate, rate[-1])[:, None]
         if r.role == "static":
             return np.zeros((r.samples, 1))

@@ -95,6 +95,11 @@ class Recording:
         seconds: Values = self.time_ns // NANOSECONDS + (self.time_ns % NANOSECONDS) / NANOSECONDS
         return seconds
 
+    @cached_property
+    def time_steps(self) -> Values:
+        """Time from each sample to the next: (n - 1,) array, s."""
+        return np.diff(self.time)
+
     @property
     def samples(self) -> int:
         """Number of samples."""

@@ -264,7 +264,7 @@ def _section_filtered(sections: Values, starts: list[int], zero_phase: bool, rea
 
 def stretch_starts(recording: Recording) -> list[int]:
     """Return the first sample of each stretch without a gap, and the number of samples."""
-    gaps = np.flatnonzero(np.diff(recording.time) > MAX_GAP_MEDIANS * recording.interval) + 1
+    gaps = np.flatnonzero(recording.time_steps > MAX_GAP_MEDIANS * recording.interval) + 1
     return [0, *gaps.tolist(), recording.samples]
 
 
@@ -275,7 +275,7 @@ def _timing_notes(recording: Recording) -> tuple[Note, ...]:
     if len(starts) > 2:
         detail = f"{recording.name}: the filter started anew after each of {len(starts) - 2} gaps"
         notes.append(Note("N-FILTER-RESTART", len(starts) - 2, 0, 0, detail))
-    dt = np.diff(recording.time)
+    dt = recording.time_steps
     uneven = np.abs(dt / recording.interval - 1.0)
     count = int(np.sum((uneven > JITTER) & (dt <= MAX_GAP_MEDIANS * recording.interval)))
     if count > 0.05 * len(dt):

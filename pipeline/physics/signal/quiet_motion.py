@@ -243,7 +243,7 @@ def step_and_noise(recording: Recording, sensor: str, rows: int | None = None) -
     The noise is the first quartile of the white noise of blocks, that of the quietest. ``rows``: that show the step.
     """
     unknown = np.full(3, np.inf)
-    values = np.asarray(recording.reading(sensor))
+    values = np.asarray(recording.reading(sensor), order="F")  # numpy is fast along a contiguous axis
     differences = np.abs(np.diff(values[np.isfinite(values).all(axis=1)], axis=0))
     count = len(differences) // DIFFERENCE_BLOCK
     if count < MIN_DIFFERENCE_BLOCKS:

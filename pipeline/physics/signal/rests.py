@@ -375,6 +375,8 @@ def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
 def stretches_of(recording: Recording, mask: Mask) -> Spans:
     """Return the runs of True in a mask, cut at gaps in time."""
     cuts = np.array(stretch_starts(recording)[1:-1], int)
+    if not cuts.size:
+        return runs(mask)
     pieces: Spans = []
     for start, stop in runs(mask):
         pieces += pairwise([start, *cuts[(cuts > start) & (cuts < stop)].tolist(), stop])
@@ -393,21 +395,25 @@ def rest_readings(recording: Recording, sensor: str, *, whole_recording: bool) -
     values = recording.reading(sensor)
     assert values is not None  # noqa: S101
     still = usable(recording, values)
-    if not whole_recording:
-        found = rests_from_table(recording)
-        if not found and recording.role == "rests":
-            found = find_rests(recording)
-        resting = np.zeros(recording.samples, bool)
-        memory = len(filter_autocovariance(recording)) - 1  # samples for which the output depends on earlier readings
-        ahead = memory if recording.filter.get("zero_phase") else 0
-        for rest in found:
-            first = rest.start + memory * (rest.start > 0)
-            resting[first : rest.stop - ahead * (rest.stop < recording.samples)] = rest.accepted
-        still &= resting
     if whole_recording:  # a gap does not end a static rest: the likelihood uses the times
         return [(recording.time[still], values[still])] if still.any() else []
-    settled = _settled(recording, values, stretches_of(recording, still))
+    settled = _settled(recording, values, stretches_of(recording, still & _resting(recording)))
     return [(recording.time[a:b], values[a:b]) for a, b in settled if b - a > 2]
+
+
+@once
+def _resting(recording: Recording) -> Mask:
+    """Return which samples are of accepted rests, for both sensors: (n,) array."""
+    found = rests_from_table(recording)
+    if not found and recording.role == "rests":
+        found = find_rests(recording)
+    resting = np.zeros(recording.samples, bool)
+    memory = len(filter_autocovariance(recording)) - 1  # samples for which the output depends on earlier readings
+    ahead = memory if recording.filter.get("zero_phase") else 0
+    for rest in found:
+        first = rest.start + memory * (rest.start > 0)
+        resting[first : rest.stop - ahead * (rest.stop < recording.samples)] = rest.accepted
+    return resting
 
 
 def _settled(recording: Recording, values: Values, stretches: Spans) -> Spans:
