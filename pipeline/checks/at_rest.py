@@ -37,7 +37,7 @@ import numpy as np
 
 from imu_logs.units import TRIADS
 from pipeline.checks.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, refusal
-from pipeline.core.records import SENSOR_UNITS, SENSORS, Note, median, quantile
+from pipeline.core.records import SENSOR_UNITS, SENSORS, Note, median
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.signal.rests import RATE_AT_REST, RATE_AT_REST_DPS, rests_from_table, runs
 
@@ -54,10 +54,8 @@ MIN_SAMPLES_OF_REST, MIN_RESTS_OF_SCATTER = 8, 3
 LOUDER = 4.0  # the scatter of 16 samples of white noise is so large in fewer than 1 of 10^9 blocks
 # quartile of a normal distribution; factor and limit of s
 QUARTER_SIZE, UNUSUAL, MAX_SCATTER_DEVIATION = 0.6745, 5.0, 0.4
-MAX_TIMES_RESTS, MAX_TIMES_DATA_SHEET = (
-    2.0,
-    4.0,
-)  # a running bench adds noise to that on a desk; data sheets state typical noise
+# a running bench adds noise to that on a desk; data sheets state typical noise
+MAX_TIMES_RESTS, MAX_TIMES_DATA_SHEET = 2.0, 4.0
 STEPPED_DEG = 0.1  # between two samples of a rest: five times what RATE_AT_REST_DPS turns in a second
 SIGNIFICANT_DEVIATIONS_AT_REST = 6.0  # standard deviations, as in pipeline.physics.signal.rests
 MIN_NOISE_SAMPLES_AT_REST = 60  # fewest that determine the noise in pipeline.estimation.noise
@@ -217,7 +215,7 @@ def _moving(
     """Return in which blocks a sensor moves, and the strongest evidence of it in words."""
     unit = SENSOR_UNITS[sensor]
     means, scatter = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
-    usual, middle = quantile(scatter, 0.25), median(scatter)
+    usual, middle = np.percentile(scatter, [25.0, 50.0], axis=0)
     tiny = np.finfo(float).tiny
     spread = np.minimum(
         np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE, MAX_SCATTER_DEVIATION
@@ -263,8 +261,8 @@ def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
         rows = np.concatenate([np.arange(0), *(np.arange(r.start, r.stop) for r in rests_from_table(recording))])
         angle = np.zeros(len(rows)) if recording.table_angle is None else recording.table_angle[rows]
         stepped = np.abs(np.diff(angle)) > STEPPED_DEG  # the table moved between two samples
-        starts = np.concatenate([[0], np.flatnonzero((np.diff(rows) > 1) | stepped) + 1])
-        ends = np.append(starts[1:], len(rows))
+        ends = np.append(np.flatnonzero((np.diff(rows) > 1) | stepped) + 1, len(rows))
+        starts = np.append(0, ends[:-1])
         long = np.flatnonzero(ends - starts >= MIN_SAMPLES_OF_REST)
         found = {s: r for s in SENSORS if (r := recording.reading(s)) is not None}
         for k in long[:: len(long) // MIN_RESTS_OF_SCATTER + 1]:
@@ -320,10 +318,8 @@ def _check_copies(recording: Recording) -> None:
         if reading is None:
             continue
         a, b = reading[:, one], reading[:, two]
-        if (
-            np.count_nonzero(np.abs(a) == np.abs(b)) <= MIN_COPIED_SHARE * MIN_AXIS_SAMPLES
-        ):  # in any rows: too few for a refusal
-            continue
+        if np.count_nonzero(np.abs(a) == np.abs(b)) <= MIN_COPIED_SHARE * MIN_AXIS_SAMPLES:
+            continue  # in any rows: too few for a refusal
         changing = a[1:] != a[:-1]
         if changing.sum() < MIN_AXIS_SAMPLES:
             continue

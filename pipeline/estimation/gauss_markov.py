@@ -198,8 +198,9 @@ def block_covariance(start: Values, length: Values, tau: float) -> Values:
     centre = start + length / 2.0
     gap = np.abs(centre[:, None] - centre) - (length[:, None] + length) / 2.0
     B: Values = np.exp(-np.maximum(gap, 0.0) / tau) * half[:, None] * half
-    rows, columns = np.nonzero((gap < -OVERLAP_S) & ~np.eye(len(start), dtype=bool))
-    if rows.size:
+    np.fill_diagonal(gap, 0.0)
+    if (overlapping := gap < -OVERLAP_S).any():
+        rows, columns = np.nonzero(overlapping)
         one, two = (np.array([start[k], start[k] + length[k]]) for k in (rows, columns))
         x = np.abs(one[:, None] - two) / tau
         F = np.expm1(-x) + x

@@ -47,7 +47,6 @@ with ``nu`` degrees of freedom of S, maximised over the white noise at every q a
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -380,7 +379,7 @@ def _likelihood(
     nu = max(float(np.sum(blocks.count - 1)) * correlated, 1e-9)
     cut = blocks.cut
     cut_blocks = Blocks(np.arange(cut.sum()), 1.0 / v[cut], blocks.start[cut], blocks.length[cut], blocks.clock[cut])
-    settings = _grid(*correlation_times.tolist())
+    settings = [Setting(ratio, tau) for tau in correlation_times.tolist() for ratio in SQRT_Q_GRID.tolist()]
     basis = orthonormal(design, v[cut], MIN_NUISANCE_SINGULAR_VALUE)
     log_determinant, squares = GaussMarkov(cut_blocks, settings).restricted(basis, blocks.mean[cut])
     inner = [np.sum(blocks.count * (1.0 - variance_of_average(blocks.length, tau))) for tau in correlation_times]
@@ -390,11 +389,6 @@ def _likelihood(
     log_likelihood = -0.5 * ((log_determinant + nu * np.log(expected))[:, None] + free * np.log(variance))
     shape = (len(correlation_times), len(SQRT_Q_GRID), -1)
     return log_likelihood.reshape(shape), np.sqrt(variance).reshape(shape)
-
-
-@cache
-def _grid(*correlation_times: float) -> list[Setting]:
-    return [Setting(ratio, tau) for tau in correlation_times for ratio in SQRT_Q_GRID.tolist()]
 
 
 def noise_of(sensor: str, recordings: Sequence[Recording], data_sheet: DataSheet) -> Noise | None:

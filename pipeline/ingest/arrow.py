@@ -18,7 +18,7 @@ from pyarrow import parquet
 
 import imu_logs
 from imu_logs.log import Log
-from imu_logs.text_write import to_arrow, to_numpy
+from imu_logs.text_write import to_numpy
 from imu_logs.units import ACCELEROMETER, ATTITUDE, CHANNELS, GYROSCOPE
 from pipeline.core.errors import InputError
 from pipeline.core.records import Note, Recording
@@ -77,19 +77,15 @@ def to_parquet(recordings: Sequence[Recording]) -> bytes:
     description = {"schema_version": PARQUET_VERSION, "recordings": entries}
     text = json.dumps(description, separators=(",", ":"), default=_plain)
     schema = pa.schema([(n, pa.type_for_alias(TYPES[n])) for n in names], metadata={METADATA_KEY: text.encode()})
-    tables = [
-        pa.Table.from_arrays(
-            [
-                to_arrow(np.ascontiguousarray(columns[n], TYPES[n])) if n in columns else pa.nulls(r.samples, kind)
-                for n, kind in zip(names, schema.types, strict=True)
-            ],
-            schema=schema,
-        )
-        for r, columns in zip(recordings, stored, strict=True)
-    ]
+    samples, arrays = [r.samples for r in recordings], []
+    for name in names if recordings else ():
+        found = [columns.get(name) for columns in stored]
+        absent = np.repeat([values is None for values in found], samples)
+        filled = [np.zeros(n, TYPES[name]) if v is None else v for n, v in zip(samples, found, strict=True)]
+        arrays.append(pa.array(np.concatenate(filled, dtype=TYPES[name]), mask=absent if absent.any() else None))
     sink = pa.BufferOutputStream()
     parquet.write_table(
-        pa.concat_tables(tables) if tables else schema.empty_table(),
+        pa.Table.from_arrays(arrays, schema=schema) if recordings else schema.empty_table(),
         sink,
         row_group_size=ROW_GROUP,
         compression="lz4",

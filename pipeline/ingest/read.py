@@ -80,12 +80,11 @@ def read_recordings(
     require_recordings(procedure, folder)
     checks, layouts = checks_of(ingest), csv_formats(ingest) if ingest.csv else None
     found, missing = set[str](), list[str]()
-    there = {*os.listdir(folder)} if folder.is_dir() else set[str]()  # noqa: PTH208
     recordings: list[Recording] = []
     refused: list[InputError] = []
     for name, candidates in candidate_files(procedure, ingest).items():
         entry = procedure.recordings[name]
-        files, wanted, unread = _existing(candidates, folder, there) if name not in in_memory else ([name], [name], [])
+        files, wanted, unread = _existing(candidates, folder) if name not in in_memory else ([name], [name], [])
         if not files:
             missing += (
                 [] if entry.optional else [f"{name} (tried {tried(candidates)}){_of_other_suffix(name, entry, folder)}"]
@@ -152,15 +151,10 @@ def _table_of(
     return read_attitudes(paths[0], layouts or (), sensor, checks_of(ingest))
 
 
-def _existing(
-    candidates: Sequence[Sequence[str]], folder: Path, listed: Collection[str]
-) -> tuple[list[str], list[str], list[str]]:
+def _existing(candidates: Sequence[Sequence[str]], folder: Path) -> tuple[list[str], list[str], list[str]]:
     """Return the files of the first candidate of which any exists, all files of it, and further existing files."""
     here = str(folder)
-    present = [
-        [f for f in c if (f in listed or "/" in f) and os.path.exists(os.path.join(here, f))]  # noqa: PTH110, PTH118
-        for c in candidates
-    ]
+    present = [[f for f in c if os.path.exists(os.path.join(here, f))] for c in candidates]  # noqa: PTH110, PTH118
     files, wanted = next(((f, list(c)) for f, c in zip(present, candidates, strict=True) if f), ([], []))
     return files, wanted, [f for existing in present for f in existing if f not in files]
 

@@ -111,10 +111,10 @@ def _ingested(files: UnitFiles, settings: Settings) -> list[Recording]:
             recordings += cut(read, turns, found=True) if turns else [read]
         else:
             recordings += cut(read, windows) if read.role == "session" else [read]
-    directory = files.directory
 
     def below(file: str) -> str:
-        return Path(file).relative_to(directory).as_posix() if Path(file).is_relative_to(directory) else file
+        path = Path(file)
+        return path.relative_to(files.directory).as_posix() if path.is_relative_to(files.directory) else file
 
     return [replace(r, source=_named(r.source, below)) for r in check_recordings(recordings, settings)]
 

@@ -100,7 +100,6 @@ from pipeline.core.records.recording import (
     noise_of_steps,
     once,
     once_of_log,
-    quantile,
     rate_of_attitude,
 )
 
@@ -118,5 +117,5 @@ __all__ = [
     "TemperatureBin", "TurnAngle", "TurnAxes", "TwoSided", "UnitRecordings", "Validation", "Values", "Wander",
     "WanderLikelihood", "base_units", "base_values", "calibrated", "conjugate_product", "continuous", "corrected",
     "coverage_factor", "cross", "files_of_readings", "finite", "fit_from_json", "level_in_body", "matrix_of", "median",
-    "motion_at_rest", "noise_of_steps", "once", "once_of_log", "quantile", "rate_of_attitude", "standard_uncertainty",
+    "motion_at_rest", "noise_of_steps", "once", "once_of_log", "rate_of_attitude", "standard_uncertainty",
 ]  # fmt: skip

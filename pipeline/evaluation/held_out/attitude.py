@@ -188,8 +188,10 @@ def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]
     fusion = imufusion.Ahrs().set_settings(settings).skip_startup().set_quaternion(q[0].copy())
     set_period, update, attitude = fusion.set_sample_period, fusion.update_no_magnetometer, fusion.get_quaternion
     # The filter compares the force with the attitude before its step.
-    for interval, rate, reading in zip(intervals.tolist(), rates, force[chosen[:-1]], strict=True):
-        set_period(interval)
+    period = 0.0
+    for interval, rate, reading in zip(intervals.astype(np.float32).tolist(), rates, force[chosen[:-1]], strict=True):
+        if interval != period:  # the filter computes in single precision
+            set_period(period := interval)
         update(rate, reading)
         q.append(attitude())
     return chosen, np.array(q, float)

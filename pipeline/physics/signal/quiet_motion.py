@@ -45,7 +45,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.records import MEDIAN_SIZE, Mask, Recording, Values, median, noise_of_steps, once, quantile
+from pipeline.core.records import MEDIAN_SIZE, Mask, Recording, Values, median, noise_of_steps, once
 from pipeline.physics.signal.filters import filter_autocovariance, variance_of_mean
 
 if TYPE_CHECKING:
@@ -250,7 +250,9 @@ def step_and_noise(recording: Recording, sensor: str, rows: int | None = None) -
         return unknown, unknown
     step = counts_of(differences[:rows])
     blocks = differences[: count * DIFFERENCE_BLOCK].reshape(count, DIFFERENCE_BLOCK, 3)
-    noise = np.sqrt(0.5 * quantile(np.mean(blocks**2, axis=1), 0.25))
+    squares, place = np.sort(np.mean(blocks**2, axis=1), axis=0), 0.25 * (count - 1)  # np.quantile is slow
+    low = squares[int(place)]
+    noise = np.sqrt(0.5 * (low + place % 1.0 * (squares[int(place) + 1] - low)))
     return np.where(step > 0.0, step, np.inf), noise
 
 
