@@ -217,10 +217,8 @@ def _moving(
     means, scatter = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
     usual, middle = np.percentile(scatter, [25.0, 50.0], axis=0)
     tiny = np.finfo(float).tiny
-    spread = np.minimum(
-        np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE, MAX_SCATTER_DEVIATION
-    )
-    louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * spread))
+    spread = np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE
+    louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * np.minimum(spread, MAX_SCATTER_DEVIATION)))
     white = data_sheet.noise_density * np.sqrt(0.5 / recording.interval)
     if len(rests):
         usual = np.minimum(usual, MAX_TIMES_RESTS * np.maximum(np.median(rests[:, 0], axis=0), white))
@@ -230,10 +228,8 @@ def _moving(
     loud = scatter / usual
     away = np.abs(means - median(means))
     change = UNKNOWN_DEGC if recording.temperature is None else float(np.ptp(recording.temperature))
-    allowed = (
-        _slow(data_sheet, change, float(recording.time[-1] - recording.time[0]))
-        + SIGNIFICANT_DEVIATIONS_AT_REST * usual
-    )
+    slow = _slow(data_sheet, change, float(recording.time[-1] - recording.time[0]))
+    allowed = slow + SIGNIFICANT_DEVIATIONS_AT_REST * usual
     moving = np.any(loud > louder, axis=1) | np.any(away > allowed, axis=1)
     if np.any(loud > louder):
         return moving, f"the {sensor} scatters {loud.max():.3g} times as usual"
@@ -264,12 +260,9 @@ def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
         ends = np.append(np.flatnonzero((np.diff(rows) > 1) | stepped) + 1, len(rows))
         starts = np.append(0, ends[:-1])
         long = np.flatnonzero(ends - starts >= MIN_SAMPLES_OF_REST)
-        found = {s: r for s in SENSORS if (r := recording.reading(s)) is not None}
-        for k in long[:: len(long) // MIN_RESTS_OF_SCATTER + 1]:
-            rest = rows[starts[k] : ends[k]]
-            both = _moments(np.concatenate([reading[rest] for reading in found.values()], axis=1)[None])
-            for i, sensor in enumerate(found):
-                moments[sensor].append(both[..., 3 * i : 3 * i + 3])
+        for k, sensor in itertools.product(long[:: len(long) // MIN_RESTS_OF_SCATTER + 1], SENSORS):
+            if (reading := recording.reading(sensor)) is not None:
+                moments[sensor].append(_moments(reading[None, rows[starts[k] : ends[k]]]))
     return {sensor: np.concatenate(parts) for sensor, parts in moments.items()}
 
 
@@ -286,7 +279,7 @@ def _rests_by_hand(recordings: Sequence[Recording], sensor: str) -> Values:
 
 
 def _moments(blocks: Values) -> Values:
-    """Return scatter, white noise and mean of (k, n, m) blocks: (k, 3, m) array.
+    """Return scatter, white noise and mean of (k, n, 3) blocks: (k, 3, 3) array.
 
     The white noise by successive differences does not include slow changes (J. von Neumann, Annals of Mathematical
     Statistics 12 (1941), 367-395).

@@ -16,10 +16,9 @@ Gravity determines them before any calibration. In a turn about a level axis the
 
 where
 
-A : table angle, counted right-handed about body axis a
-u : body axis that points up at A = 0
-K : inverse of the calibration matrix, the unit matrix to a few percent; b: bias
-d : in a turn between rests, a combination of r (rate dependence), |r| (vibration) and r^2 (lever arms), with rate r
+A : table angle, counted right-handed about body axis a u : body axis that points up at A = 0 K : inverse of the
+calibration matrix, the unit matrix to a few percent; b: bias d : in a turn between rests, a combination of r (rate
+dependence), |r| (vibration) and r^2 (lever arms), with rate r
 
 ``q x p`` points along the turn axis, and p and q determine face and zero. If the angle counts left-handed, q changes
 its sign. The gain of the gyroscope against the table's rate points along the turn axis, too:
@@ -152,10 +151,9 @@ def off_at_rest(recording: Recording, bench: TurnMounting) -> float:
     Where all rests are at one angle, a bias of 0.1 g changes it by 6 deg.
     """
     angle, force = recording.table_angle, recording.accelerometer
-    slope = recording.slope_of_angle
-    if angle is None or force is None or slope is None:
+    if angle is None or force is None:
         return 0.0
-    still = still_samples(recording.time, slope) & recording.valid
+    still = still_samples(recording.time, np.gradient(angle, recording.time)) & recording.valid
     if np.sum(still) < MIN_ANGLE_SAMPLES:
         return 0.0
     A = np.radians(bench.sense * angle[still] + bench.offset)
@@ -235,7 +233,8 @@ class TurnFit:
 def fit_turn(recording: Recording) -> TurnFit:
     """Return c, p, q and k of a turn whose log has the table's angle, its rate, or both."""
     angle, rate = recording.table_angle, recording.table_rate
-    slope, used = recording.slope_of_angle, recording.logged_rate
+    slope = None if angle is None or recording.samples < 2 else np.gradient(angle, recording.time)
+    used = slope if rate is None else rate
     gain = _gain(recording, used)
     if gain is not None and rate is not None and slope is not None and float(rate @ slope) < 0.0:
         gain = -gain  # the rate counts against the angle: here the angle counts; the check of the reference refuses it

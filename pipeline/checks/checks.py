@@ -223,10 +223,8 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
         for step in np.unique(steps[steps > 0.0]):
             off = np.sqrt(3.0) * rounding[steps == step].max()  # half-width of a rectangle
             axes = ", ".join(name for name, s in zip(TRIADS[sensor], steps, strict=True) if s == step)
-            digits = next(
-                (f", {d} decimal{'s' * (d != 1)}," for d in range(MAX_SIGNIFICANT_DIGITS) if _is_whole(step * 10.0**d)),
-                "",
-            )
+            whole = (d for d in range(MAX_SIGNIFICANT_DIGITS) if _is_whole(step * 10.0**d))
+            digits = next((f", {d} decimal{'s' * (d != 1)}," for d in whole), "")
             detail = (
                 f"{axes}: steps of {step:.3g} {SENSOR_UNITS[sensor]}{digits} and noise of less than half a step: "
                 f"means are off by up to {off:.3g} {SENSOR_UNITS[sensor]}, however long the "

@@ -141,9 +141,7 @@ def of_table(recording: Recording) -> tuple[Channel, ...]:
 @once_of_log
 def spin(recording: Recording) -> Values:
     """Return the rotation vector, in the body, from each logged attitude to the next: (n - 1, 3) array, deg."""
-    attitude = recording.table_attitude
-    assert attitude is not None  # noqa: S101
-    q = continuous(attitude)
+    q = continuous(np.asarray(recording.table_attitude))
     sine = conjugate_product(q[:-1], q[1:])
     size = np.linalg.norm(sine, axis=1, keepdims=True)
     angle = 2.0 * np.arcsin(np.minimum(size, 1.0))

@@ -125,13 +125,10 @@ class ChannelComparison:
         if not others or claim.name in OF_SENSOR:
             return None
         alone = all(w.name in OF_SENSOR for w in others)
-        gross: list[Values] = []
-        doubt: list[Values] = []
-        for w in others:
-            for kind, excess in zip((gross, doubt), self._rows(claim, w, alone=alone), strict=True):
-                kind.append(excess)
-            if not np.any(np.min(doubt, axis=0) > 0.0):
-                break  # nor is anything gross: effects allow at least what the stated accuracy allows
+        rows: list[tuple[Values, Values]] = []  # effects allow at least what the stated accuracy allows
+        while len(rows) < len(others) and (not rows or np.any(np.min([doubt for _, doubt in rows], axis=0) > 0.0)):
+            rows.append(self._rows(claim, others[len(rows)], alone=alone))
+        gross, doubt = zip(*rows, strict=True)
         contradiction = self._worst_row(claim, others, gross) or self._worst_stretch(claim, others)
         found = contradiction or self._worst_row(claim, others, doubt)
         if not found:
@@ -189,7 +186,7 @@ class ChannelComparison:
             starts = np.arange(0, max(n - size // 2, 1), size)
             turned, total, bends, _ = self._sums(claim, size, starts)
             length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)
-            excess, sums, off = [], [], np.full(len(starts), np.inf)
+            excess, sums = [], []
             for other in others:
                 shown, shown_total, shown_bends, swing = self._sums(other, size, starts)
                 most = np.maximum(total, shown_total)
@@ -202,9 +199,9 @@ class ChannelComparison:
                     allowed += share * most + limits.late_s * swing + limits.offset_dps * length + noise
                 excess.append(np.abs(turned - shown) - allowed)
                 sums.append(shown)
-                off = np.minimum(off, excess[-1])
-                if not np.any(off > 0.0):
+                if np.all(excess[-1] <= 0.0):
                     break
+            off = np.min(excess, axis=0)
             rows = np.flatnonzero(off > 0.0)
             if rows.size:
                 worst = int(np.argmax(off))

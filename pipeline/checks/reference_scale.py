@@ -93,7 +93,7 @@ GRAVITY_TURNS = ("gravity's direction", 1e-2)  # relative: clocks without quartz
 SAME_ANGLE = 2e-4  # relative: 0.07 deg in a turn, error of gravity's direction by an accelerometer's nonlinearities
 # samples; blocks of a sandwich estimate; Gauss-Newton steps
 FEWEST_OF_A_GEAR, BLOCKS_OF_A_GEAR, GEAR_ITERATIONS = 200, 24, 4
-SURELY = 0.9  # share of what is allowed: further steps change the first by a tenth at most
+SURELY, LINEAR_G = 0.9, 0.03  # share of what is allowed, rms residual: see _gear
 CONVERGED = 1e-12  # relative step, far below the uncertainty of any ratio
 SHARES = np.arange(1, BLOCKS_OF_A_GEAR) / BLOCKS_OF_A_GEAR
 UNIT_FACTOR_TOLERANCE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
@@ -216,7 +216,8 @@ def _gear(recording: Recording, allowed: float) -> tuple[float, float] | None:
     """Return the ratio of the table's angle to gravity's, and its standard uncertainty.
 
     None if it is unknown, or if the first step shows that it differs from 1 by less than is ``allowed`` or significant.
-    Further steps change the first by a tenth at most, and the uncertainty is at least that of independent errors.
+    A residual r below 0.03 g is that of a phase error p below 0.3 rad (r = p^2 / 2 on a third of the turn). Further
+    steps change the first by p^2 / 6 at most, and r enlarges its six uncertainties by 5 % of it at most (200 samples).
     """
     angle, rate, force = recording.table_angle, recording.logged_rate, recording.accelerometer
     if recording.role != "gyroscope":  # in a turn of minutes, a bias that follows the temperature has the same signal
@@ -245,7 +246,8 @@ def _gear(recording: Recording, allowed: float) -> tuple[float, float] | None:
         information = float(np.sum(d * d))
         step = float(np.sum(d * e)) / information
         white = float(np.sqrt(max(np.mean(e * e) - step * step * information / e.size, 0.0) / information))
-        if iteration == 0 and abs(step) <= SURELY * (allowed + SIGNIFICANT_UNCERTAINTIES * white):
+        small = np.mean(e * e) < LINEAR_G**2
+        if iteration == 0 and small and abs(step) <= SURELY * (allowed + SIGNIFICANT_UNCERTAINTIES * white):
             return None
         a = a * (1.0 + step)
         if abs(step) < CONVERGED:

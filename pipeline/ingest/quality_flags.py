@@ -103,7 +103,7 @@ def flag_clipped(table: Log, sensor: str, full_scale: float, flags: NDArray[np.u
         values = table.values[channel]
         count = table.count_sizes.get(channel, 0.0)
         largest = max(float(values.max()), -float(values.min()))
-        if largest < full_scale - max(1.5 * count, RAIL * full_scale):
+        if largest < (least := full_scale - max(1.5 * count, RAIL * full_scale)):
             continue
         size = np.abs(values)
         if largest > FULL_SCALE_MARGIN * full_scale:
@@ -116,9 +116,7 @@ def flag_clipped(table: Log, sensor: str, full_scale: float, flags: NDArray[np.u
             raise IngestError(message, table.place(row), code="beyond_full_scale")
         # Many sensors read beyond their nominal range (131 counts per deg/s reach 250.1 deg/s), some by a fifth: a
         # largest value beyond the range that occurs more than once is clipped, too.
-        clipped = (size >= full_scale - max(1.5 * count, RAIL * full_scale)) & (
-            size <= (1.0 + FULL_SCALE_TOLERANCE) * full_scale
-        )
+        clipped = (size >= least) & (size <= (1.0 + FULL_SCALE_TOLERANCE) * full_scale)
         at_largest = size >= size.max() - 1.5 * count
         if size.max() > full_scale and at_largest.sum() > 1:
             clipped |= at_largest
@@ -243,10 +241,7 @@ def equal_share(same: Mask) -> float:
     whole = len(same) // NEIGHBOUR_WINDOW * NEIGHBOUR_WINDOW
     if whole == 0:
         return 1.0
-    shares = (
-        np.bincount(np.flatnonzero(same[:whole]) // NEIGHBOUR_WINDOW, minlength=whole // NEIGHBOUR_WINDOW)
-        / NEIGHBOUR_WINDOW
-    )
+    shares = same[:whole].reshape(-1, NEIGHBOUR_WINDOW).mean(axis=1)
     partial = shares[shares < 1.0]
     if not partial.size:
         return 1.0

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from pipeline.core.records import SensorValidation, Validation, calibrated
 from pipeline.estimation.noise import required_noises
 from pipeline.evaluation.held_out.attitude import attitude, gravity_direction, turn_departures
+from pipeline.evaluation.held_out.samples import OTHER_SENSOR
 from pipeline.evaluation.held_out.validation import validate
 
 if TYPE_CHECKING:
@@ -35,11 +36,7 @@ def held_out_errors(
     """Return the errors of each sensor; None for a sensor without a calibration."""
     known = calibrated(fits)
     noises = required_noises(recordings, settings.sensor, known)
-    found: dict[str, SensorValidation | None] = {}
-    for sensor, calibration in known.items():
-        other = next(c for s, c in known.items() if s != sensor)
-        if calibration is None:
-            found[sensor] = None
-        else:
-            found[sensor] = validate(calibration, recordings.filtered, noises[sensor], settings, other=other)
-    return found
+    return {
+        s: None if c is None else validate(c, recordings.filtered, noises[s], settings, other=known[OTHER_SENSOR[s]])
+        for s, c in known.items()
+    }

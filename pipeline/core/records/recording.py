@@ -143,13 +143,8 @@ class Recording:
     @cached_property
     def logged_rate(self) -> Values | None:
         """Rate of the table, deg/s: the logged rate, else central differences of its angle; None without both."""
-        return self.slope_of_angle if self.table_rate is None else self.table_rate
-
-    @cached_property
-    def slope_of_angle(self) -> Values | None:
-        """Central differences of the table's angle, deg/s; None without it."""
-        if self.table_angle is None or self.samples < 2:
-            return None
+        if self.table_rate is not None or self.table_angle is None or self.samples < 2:
+            return self.table_rate
         return np.asarray(np.gradient(self.table_angle, self.time))
 
     @property

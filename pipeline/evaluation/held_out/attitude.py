@@ -175,15 +175,9 @@ def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]
     sine = np.maximum(np.linalg.norm(v, axis=0), np.finfo(float).tiny)
     angles = np.degrees(2.0 * np.arctan2(np.copysign(sine, w), np.abs(w)))
     rates = (angles / sine * v / intervals).T
-    settings = imufusion.AhrsSettings(
-        sample_rate=float(1.0 / np.median(intervals)),
-        convention=imufusion.CONVENTION_NWU,
-        gain=FILTER_GAIN,
-        gyroscope_range=0.0,
-        acceleration_rejection=0.0,
-        magnetic_rejection=0.0,
-        rejection_timeout=0.0,
-    )
+    off = dict.fromkeys(("gyroscope_range", "acceleration_rejection", "magnetic_rejection", "rejection_timeout"), 0.0)
+    frequency, NWU = float(1.0 / np.median(intervals)), imufusion.CONVENTION_NWU
+    settings = imufusion.AhrsSettings(sample_rate=frequency, convention=NWU, gain=FILTER_GAIN, **off)
     q = [alone[:, 0]]
     fusion = imufusion.Ahrs().set_settings(settings).skip_startup().set_quaternion(q[0].copy())
     set_period, update, attitude = fusion.set_sample_period, fusion.update_no_magnetometer, fusion.get_quaternion

@@ -174,16 +174,9 @@ def _figures(name: str, corrected: Sequence[Corrected]) -> tuple[float, StepErro
     directed = all(true is not None for _, _, true in corrected)
     off = vector_errors(corrected, directed=True)[known] if directed else None
     error = error[known]
-    mean = float(np.mean(np.abs(error)))
-    return mean, StepErrors(
-        name,
-        mean,
-        float(np.sum(np.abs(error))),
-        float(np.max(error)),
-        float(np.min(error)),
-        float(np.sqrt(np.mean(error**2))),
-        vector_rms_error=None if off is None else float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
-    )
+    mean, total, rms = float(np.mean(np.abs(error))), float(np.sum(np.abs(error))), float(np.sqrt(np.mean(error**2)))
+    vector = None if off is None else float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+    return mean, StepErrors(name, mean, total, float(error.max()), float(error.min()), rms, vector_rms_error=vector)
 
 
 def _lack(fitted: FittedEffect, samples: Samples) -> str | None:

@@ -170,16 +170,9 @@ def residuals_over_temperature(
     if len(warmth) == 0 or np.ptp(warmth) < SWEEP_DEGC:
         return None
     number = np.floor(warmth / BIN_DEGC)
-    return [
-        TemperatureBin(
-            float(warmth[in_bin].mean()),
-            float(error[in_bin].mean()),
-            float(np.sqrt(np.mean(error[in_bin] ** 2))),
-            int(in_bin.sum()),
-        )
-        for each in np.unique(number)
-        if (in_bin := number == each).sum() >= FEWEST_IN_BIN
-    ]
+    masks = (number == each for each in np.unique(number))
+    parts = [(warmth[mask], error[mask]) for mask in masks if mask.sum() >= FEWEST_IN_BIN]
+    return [TemperatureBin(float(w.mean()), float(e.mean()), float(np.sqrt(np.mean(e**2))), len(e)) for w, e in parts]
 
 
 def _is_swept(recordings: Sequence[Recording]) -> bool:

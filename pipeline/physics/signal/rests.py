@@ -375,12 +375,10 @@ def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
 def stretches_of(recording: Recording, mask: Mask) -> Spans:
     """Return the runs of True in a mask, cut at gaps in time."""
     cuts = np.array(stretch_starts(recording)[1:-1], int)
+    spans = runs(mask)
     if not cuts.size:
-        return runs(mask)
-    pieces: Spans = []
-    for start, stop in runs(mask):
-        pieces += pairwise([start, *cuts[(cuts > start) & (cuts < stop)].tolist(), stop])
-    return pieces
+        return spans
+    return [each for a, b in spans for each in pairwise([a, *cuts[(cuts > a) & (cuts < b)].tolist(), b])]
 
 
 def usable(recording: Recording, values: Values) -> Mask:
