@@ -1,0 +1,109 @@
+"""Compares the stated probability of answer sets with the share that is true, for sizes that a study seldom hides.
+
+    python benchmarks/probabilities.py prior|near --n 220 [--first 0] [--seed 991] [--figures FILE]
+
+prior: each effect is hidden with its prior probability, at a scale and size drawn from the prior of the posterior
+    (``pipeline.estimation.evidence``). There the share should be the stated probability.
+near: one effect at 0.5 to 1.5 times the size at which a selection just passes its gate. The prior draws few such sizes,
+    so that the share may be smaller.
+
+The truth of a unit is the set of its hidden effects without those that are stated as not observable.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from imu_research.figures import clustered_share, write_figures
+from imu_research.study.bench import at_detection
+from imu_research.study.cases import StudyCase, draw
+from imu_research.study.run import diagnose_case, scored
+from pipeline.core.errors import PipelineError
+from pipeline.core.records import SENSORS
+from pipeline.estimation.candidates import limits_of
+from pipeline.estimation.evidence import LIMIT_SCALES, SCALE_PRIOR
+from pipeline.estimation.posterior import INCLUSION
+from pipeline.estimation.selection import DELAYS
+from pipeline.physics.effects import effect
+from pipeline.simulation.description import shipped_settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+NOT_SIMULATED = ("temperature_lag",)  # needs a chamber
+OF_DETECTION = 0.5, 1.5  # times the detection size
+TIME_CONSTANTS_S = 90.0, 400.0  # of a warm-up, as in a study
+
+
+def of_prior(number: int, seed: int) -> StudyCase:
+    """Draw effects and sizes from the prior."""
+    rng = np.random.default_rng([seed, number, 7])
+    sensor = str(rng.choice(SENSORS))
+    procedure = str(rng.choice(["stop_and_go", "continuous", "one_way"], p=[0.5, 0.3, 0.2]))
+    limits = limits_of(sensor, shipped_settings(sensor="mpu6050", table="acutronic").sensor.of(sensor))
+    while True:
+        names = [name for name in limits if name not in NOT_SIMULATED and rng.random() < INCLUSION]
+        within = any(name in effect(other).contains for name in names for other in names)
+        if not within and not set(DELAYS) <= set(names):
+            break
+    hidden = {}
+    for name in names:
+        scale = float(rng.choice(LIMIT_SCALES, p=np.exp(SCALE_PRIOR) / np.exp(SCALE_PRIOR).sum()))
+        values = limits[name] * scale * rng.standard_normal(len(limits[name]))
+        if name == "warm_up":
+            values[3] = np.exp(rng.uniform(*np.log(TIME_CONSTANTS_S)))
+        hidden[name] = (np.abs(values) if name == DELAYS[1] else values).tolist()
+    return StudyCase("single", number, seed, "mpu6050", sensor, procedure, hidden)
+
+
+def near_gate(number: int, seed: int) -> StudyCase:
+    """Draw one effect near its detection size."""
+    case = at_detection(draw("limit_100", number, seed))
+    share = float(np.random.default_rng([seed, number, 8]).uniform(*OF_DETECTION))
+    ((name, values),) = case.hidden.items()
+    kept = [p.name == "time_constant" for p in effect(name).parameters(case.sensor)]
+    return replace(case, hidden={name: np.where(kept, values, share * np.array(values)).tolist()})
+
+
+DRAWN: dict[str, Callable[[int, int], StudyCase]] = {"prior": of_prior, "near": near_gate}
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sizes", choices=DRAWN)
+    parser.add_argument("--n", type=int, default=220)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=991)
+    parser.add_argument("--figures", type=Path)
+    options = parser.parse_args()
+    stated, true = [], []
+    for number in range(options.first, options.first + options.n):
+        case = DRAWN[options.sizes](number, options.seed)
+        try:
+            _, state = diagnose_case(case)
+        except PipelineError as refusal:  # of effects far beyond their limits
+            sys.stderr.write(f"{number}: refused: {refusal.message}\n")
+            continue
+        found = scored(state, case.sensor)
+        truth = sorted(set(case.hidden) - set(found["not_observable"]))
+        answers = [sorted(answer["effects"]) for answer in found["answer_set"]]
+        stated.append(min(1.0, sum(answer["probability"] for answer in found["answer_set"])))
+        true.append(np.array([truth in answers]))
+        sys.stdout.write(f"{number} {case.sensor} {sorted(case.hidden)}: {stated[-1]:.3f} {truth in answers}\n")
+    mean = 100.0 * float(np.mean(stated))
+    goal = f"contains {mean:.4g} %" if options.sizes == "prior" else ""
+    figures = clustered_share(f"answer sets, sizes {options.sizes}, stated {mean:.4g} %", true, goal)
+    sys.stdout.write("\n".join(" | ".join(map(str, figure.cells)) for figure in figures) + "\n")
+    if options.figures:
+        write_figures(options.figures, figures)
+
+
+if __name__ == "__main__":
+    main()
