@@ -1,13 +1,14 @@
 """Measure the evidence of docs/evidence.md, and write the page from what is stored.
 
-    python benchmarks/evidence.py run [NAME ...] [--share 0.1] [--cores 2] [--imu-tk FOLDER] [--xsens FOLDER]
+    python benchmarks/evidence.py run [NAME ...] [--share 0.1] [--cores 2] [--imu-tk DIR] [--xsens DIR] [--sets DIR]
     python benchmarks/evidence.py page
 
 ``run`` executes the command of each measure in ``benchmarks/evidence/measures.yaml`` and stores its figures with date
 and commit in ``benchmarks/evidence/stored/NAME.json``. A share below 1 runs that part of each, stores nothing, and
 compares: exit code 1 where a stored figure is outside the interval of the part, widened to 99.9 %. ``page`` writes
 docs/evidence.md from ``benchmarks/evidence/page.md``; a goal that is missed is bold. The measure ``peers`` needs
-imucal 2.6.0 and the source of imu_tk, ``real`` the recording of an Xsens MTi (``benchmarks/peers.py`` states both).
+imucal 2.6.0 and the source of imu_tk, ``real`` the recording of an Xsens MTi (``benchmarks/peers.py`` states both) and
+the sets of ``benchmarks/sets/sources.yaml``.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class Measure:
     def shown(self) -> str:
         """The command as a reader types it."""
         return self.command.format(
-            n=self.n, folder="DIR", cores=2, figures="FILE", imu_tk="IMU_TK", xsens="XSENS"
+            n=self.n, folder="DIR", cores=2, figures="FILE", imu_tk="IMU_TK", xsens="XSENS", sets="SETS"
         ).removesuffix(" --figures FILE")
 
 
@@ -145,7 +146,7 @@ def page() -> str:
     return environment.get_template("page.md").render(
         stored=stored,
         methods=dict.fromkeys(figure.name.rpartition(", ")[0] for figure in stored["coverage"].figures),
-        real=dict.fromkeys(figure.name.rpartition(", ")[0] for figure in stored["real"].figures),
+        real=dict.fromkeys(f.name.rpartition(", ")[0] for f in stored["real"].figures if not f.name.startswith("CPU")),
     )
 
 
@@ -188,6 +189,7 @@ def main() -> int:
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--imu-tk", default="imu_tk", help="folder of its source, commit 7780270")
     parser.add_argument("--xsens", default="xsens", help="folder of accelerometer.txt and gyroscope.txt")
+    parser.add_argument("--sets", default="sets", help="folder of the clones of benchmarks/sets/sources.yaml")
     options = parser.parse_intermixed_args()
     if options.what == "page":
         PAGE.write_text(page(), encoding="utf-8")

@@ -126,6 +126,27 @@ def test_the_shipped_recordings_are_those_of_the_authors() -> None:
         assert (file / "LICENSE").read_text().startswith("MIT License")
 
 
+def test_the_gyroscope_of_a_drone_follows_the_temperature_as_least_squares_do(shipped: Bench) -> None:
+    """Cooled and heated by 90 degC; judged on another cooling. Its authors fit polynomials by ``numpy.polyfit``."""
+    rows, held = (
+        np.loadtxt(SHIPPED / "raw" / "chamber" / f"{name}.csv", delimiter="\t", skiprows=1)
+        for name in ("cool_heat", "cool")
+    )
+    found = document(shipped, "calibrations", "chamber")["gyroscope"]
+    (effect,) = found["effects"]
+    powers = [[effect["parameters"][f"b_T{k}_{axis}"]["value"] for axis in "xyz"] for k in (1, 2)]
+    own = np.polynomial.polynomial.polyfit(rows[:, 8] - 25.0, rows[:, 1:4], 2)
+    excess = np.arange(-17.0, 74.0) - 25.0
+    curves = [np.polynomial.polynomial.polyval(excess, c) for c in (np.array([found["bias"], *powers]), own)]
+    assert np.abs(curves[0] - curves[1]).max() < 0.05 * np.ptp(curves[1], axis=1).max()
+    rest = held[:, 1:4] - np.polynomial.polynomial.polyval(held[:, 8] - 25.0, own).T
+    validation = document(shipped, "validations", "chamber")["gyroscope"]
+    raw, last = (validation["steps"][k]["rms_error"] for k in (0, -1))
+    assert last < 1.1 * np.sqrt(np.mean(np.sum(rest**2, axis=1)))
+    assert raw > 6.0 * last
+    assert found["determined_by"]["bias"] == ["recordings"] * 3
+
+
 def test_the_stored_evidence_is_what_the_shipped_campaign_gives(shipped: Bench) -> None:
     file = ROOT / "benchmarks" / "evidence" / "stored" / "real.json"
     stored = {figure["name"]: figure for figure in json.loads(file.read_text())["figures"]}
