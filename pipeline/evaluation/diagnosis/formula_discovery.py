@@ -62,6 +62,7 @@ MAX_FORMULA_TERMS = 3
 REFINED = 16  # forms that are scored under every noise setting, and whose constants are scanned more finely
 SCAN_REFINEMENTS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
 CACHED = 512  # columns of block means that are whitened together: they stay in the processor's cache
+ROWS_AT_ONCE = 8192  # whose products of columns are computed together: 20 MB
 PROBED = 200  # rows; two forms whose values there are equal to 1e-9 are one
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
 OBSERVABLE_BY = {"temperature": "bias_temperature"}  # effect that is observable if the recordings vary the covariate
@@ -128,7 +129,8 @@ class FormProducts:
         sums = np.stack([F[at].T @ weighted[at] for at in starmap(slice, pairwise(edges))])
         self.means = sums.reshape(len(sums), -1) / scan.blocks.weight[:, None]
         between = (scan.blocks.weight @ self.means**2).reshape(F.shape[1], -1)
-        self.inside = np.maximum((F**2).T @ (weighted * G) - between, 0.0)
+        whole = sum((F[at] ** 2).T @ (weighted[at] * G[at]) for at in _pieces(len(F)))
+        self.inside = np.maximum(whole - between, 0.0)
 
     def squares(self, scan: Scan) -> Values:
         """Return the whitened squares of the products: (t, q, p) array."""
@@ -168,9 +170,16 @@ class FormProducts:
     def _with_columns(self, scan: Scan, at: slice) -> Values:
         columns = np.sqrt(scan.weight)[:, None] * scan.every.inside[:, at]
         shape = *self.inside.shape, columns.shape[1]
-        inside = self.columns[0].T @ (self.columns[1][:, :, None] * columns[:, None]).reshape(len(columns), -1)
+        F, pieces = self.columns[0], _pieces(len(columns))
+        products = ((self.columns[1][at, :, None] * columns[at, None]).reshape(len(F[at]), -1) for at in pieces)
+        inside = sum(F[at].T @ product for at, product in zip(pieces, products, strict=True))
         between = self.means.T @ scan.noise.solve(scan.means(scan.columns[:, at]))
-        return np.asarray(between.reshape(-1, *shape) + inside.reshape(shape))
+        return np.asarray(between.reshape(-1, *shape) + np.reshape(inside, shape))
+
+
+def _pieces(rows: int) -> list[slice]:
+    """Return the rows in pieces, so that the memory of a product of columns is bounded."""
+    return [slice(first, first + ROWS_AT_ONCE) for first in range(0, rows, ROWS_AT_ONCE)]
 
 
 class Forms:
