@@ -22,7 +22,14 @@ from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
 from pipeline.evaluation.diagnosis import turntable
-from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, suggested_effect, why_not_suggested
+from pipeline.evaluation.diagnosis.formula_discovery import (
+    Discovery,
+    FormProducts,
+    Forms,
+    discover,
+    suggested_effect,
+    why_not_suggested,
+)
 from pipeline.evaluation.diagnosis.functional_forms import (
     Factor,
     Form,
@@ -30,6 +37,7 @@ from pipeline.evaluation.diagnosis.functional_forms import (
     Scan,
     Span,
     columns_of,
+    exponential,
     harmonic,
     power,
     step,
@@ -37,6 +45,7 @@ from pipeline.evaluation.diagnosis.functional_forms import (
 from pipeline.evaluation.diagnosis.residual_dependence import dependences
 from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.physics.effects import effect_from, forget, register
+from pipeline.physics.formula import parse
 from pipeline.physics.kinematics import reference_motion
 from pipeline.physics.signal.filters import smooth_temperature
 from pipeline.simulation.description import shipped_settings
@@ -254,6 +263,28 @@ def test_a_scan_of_single_forms_finds_what_the_products_of_all_curves_say() -> N
         one, other = scan.best_axes(found, 2)[0], scan.best_axes(expected, 2)[0]
         assert (one.axes, one.setting) == (other.axes, other.setting)
         assert one.delta_bic == pytest.approx(other.delta_bic, rel=1e-5)
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_products_of_factors_and_modulators_gain_what_the_columns_of_the_forms_gain(*, apart: bool) -> None:
+    selection = selection_of("gyroscope", with_extra("gyroscope", gear(5e-4)))
+    scan, grammar = Scan(selection), Forms(selection)
+    for tried in ([power("speed", 2), power("fx", 3)], [harmonic(5), harmonic(6)]):
+        for modulator in (None, power("u", 1), power("time", 1)):
+            found = FormProducts(grammar, [Form(f, modulator) for f in tried], scan, apart=apart).gains(scan)
+            values = [scan.values(columns_of(Form(f, modulator).formulas, "gyroscope")) for f in tried]
+            expected = scan.best_axes(scan.drops(np.stack(values, axis=2)), len(tried[0].texts))
+            assert [each.axes for each in found] == [each.axes for each in expected]
+            for one, other in zip(found, expected, strict=True):
+                assert one.delta_bic == pytest.approx(other.delta_bic, rel=1e-6, abs=1e-6)
+
+
+def test_the_values_of_steps_and_exponentials_are_those_of_their_formulas() -> None:
+    span = Span("time", np.linspace(3.0, 1234.56789, 50))
+    slow = [exponential(span, 123.456789, growth=growth) for growth in (True, False)]
+    for factor in (step(span, 333.3333333), step(span, 333.3333333, 12.3456), *slow):
+        values = factor.values(span.values)
+        assert values == pytest.approx(parse(factor.texts[0])({"time": span.values}), rel=1e-12)
 
 
 def test_a_shape_gains_what_a_joint_fit_with_it_gains() -> None:
