@@ -90,7 +90,7 @@ def test_the_noise_of_a_run_has_no_intervals_and_names_what_gives_them(campaign:
         for overrides in ((), ["diagnosis.depth=full"])
     ]
     stated, full = (part["axes"]["x"]["terms"]["white"] for part in parts)
-    command = "python -m pipeline noise raw/U001/static.csv --ingest canonical_csv --sensor mpu6050"
+    command = "python -m pipeline noise CAMPAIGN/raw/U001/static.csv --ingest canonical_csv --sensor mpu6050"
     assert parts[0]["intervals_by"] == f"{command}, or a run with diagnosis.depth=full"
     assert stated["interval"] is None
     assert "intervals_by" not in parts[1]

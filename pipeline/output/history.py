@@ -255,12 +255,16 @@ def _changed_values(before: JSON, after: JSON) -> list[str]:
 
 
 def dropped(entries: Sequence[JSON]) -> dict[tuple[str, int], list[str]]:
-    """Return the effects (``sensor.effect``) that the last run no longer has, by unit and run that had them."""
+    """Return the effects (``sensor.effect``) that the last run no longer has, by unit and run that had them.
+
+    Another method has other effects: those of its stages are not lost.
+    """
     lost, states = {}, of_units(entries)
     for unit in entries[-1]["units"]:
         if len(states[unit]) > 1:
             (run, before), (_, after) = states[unit][-2:]
             removed = difference(before, after).removed
-            if effects := [f"{sensor}.{effect}" for sensor in SENSORS for effect in removed[sensor]]:
+            old, new = ((state.get("overrides") or {}).get("method") for state in (before, after))
+            if old == new and (effects := [f"{sensor}.{effect}" for sensor in SENSORS for effect in removed[sensor]]):
                 lost[unit, run] = effects
     return lost

@@ -136,7 +136,7 @@ def test_by_hand_the_angle_after_moves_is_said_first_with_how_many_judge_it(know
     words = {s: in_words(found[s], s) for s in SENSORS}
     page = render(known.calibration, validation, found, [], settings, words=words)
     card = Text(page[page.index("<h2>Gyroscope</h2>") :]).text
-    assert card.index("0.813 deg error after a held-out move, 12.9 × noise") < card.index("At rest")
+    assert card.index("0.813 deg mean error after held-out moves, 12.9 × noise") < card.index("At rest")
     assert "Judged by 1 held-out rest and 2 held-out moves." in card
     assert "does not show that the calibration is good" in card
     row = summary_row("U1", known.calibration, validation, found, {})

@@ -120,12 +120,13 @@ def test_add_names_the_files_whose_error_changes() -> None:
     error = was.held_out_errors(less=False)["accelerometer", "px4.params"]
     assert now.held_out_errors(less=True)["accelerometer", "px4.params"] == pytest.approx(error, rel=0.05)
     (line,) = [line for line in changed_files("U", was, now) if "px4.params" in line]
-    assert line.startswith("U, accelerometer, held-out error as before in files that hold less: ")
+    assert line.startswith("U, accelerometer: these files cannot hold it, and their error stays: ")
     assert not changed_files("U", now, now)
     for held in now.validation["accelerometer"]["reduced"]:
         if held["part"] == "diagonal":
             held["rms_error"] = 1.2 * error
-    (line,) = [line for line in changed_files("U", was, now) if "px4.params" in line]
+    changed = ExportedUnit(now.document, {}, validation=now.validation)
+    (line,) = [line for line in changed_files("U", was, changed) if "px4.params" in line]
     change = f"{error:.3g} -> {1.2 * error:.3g} g: "
     assert line.startswith(f"U, accelerometer, held-out error of files that hold less {change}")
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 import platform
 from functools import cache
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -138,6 +139,7 @@ def _noise(checked: Sequence[Recording], settings: Settings) -> dict[str, Any]:
                 file = next(r.source.get("file") for r in checked if r.name == part["recordings"][0])
                 chosen = {"ingest": settings.ingest.name, "sensor": settings.sensor.name}
                 options = "".join(f" --{key} {name}" for key, name in chosen.items())
+                file = file if Path(str(file)).is_absolute() else f"CAMPAIGN/{file}"
                 part["intervals_by"] = f"python -m pipeline noise {file}{options}, or {part['intervals_by']}"
     return noise
 

@@ -117,6 +117,7 @@ def render(
         far_shown=FAR_SHOWN,
         states={state.row["unit"]: state for state in states},
         far=MARK_ABOVE_FLOORS,
+        judged_on=judged_on(rows),
         causes=sorted(causes.items(), key=lambda cause: -len(cause[1])),
         about=about or {},
         devices=len(devices),
@@ -143,6 +144,14 @@ def render(
     return text
 
 
+def judged_on(rows: Sequence[Mapping[str, Any]], sensors: Sequence[str] = SENSORS) -> str:
+    """Return in words where the errors of units are: on held-out motion, or without it on the samples of the fit."""
+    of_fit = sum(any(isinstance(row.get(f"{s}_not_held_out"), str) for s in sensors) for row in rows)
+    if of_fit in (0, len(rows)):
+        return "on the samples of the fit" if of_fit else "on held-out motion"
+    return f"on held-out motion (of {of_fit} units on the samples of the fit)"
+
+
 def overview_chart(sensor: str, rows: Sequence[JSON | RowState]) -> UnitChart | None:
     """Draw the error over the noise floor of each unit, and return the text of each dot by its colour.
 
@@ -165,7 +174,8 @@ def overview_chart(sensor: str, rows: Sequence[JSON | RowState]) -> UnitChart | 
         count = f"{len(moved)} of {len(known)} units {KINDS[FAR].name}"
         finding = typeset(f"{sensor.capitalize()}: {count}; {moved[0][0]} in {moved[0][1]}")
     kind = "vector" if all(errors[i].kind == "vector" for i in known) else "magnitude"
-    caption = f"Error of the {kind} on held-out motion, over the error that noise alone gives; lines: 1 × and 3 ×."
+    place = judged_on([s.row for s in states], [sensor])
+    caption = f"Error of the {kind} {place}, over the error that noise alone gives; lines: 1 × and 3 ×."
     description, label = f"{finding}{middle}.", "error over noise floor (logarithmic)"
     groups = ((ready, 2, "ready"), (~ready, 0, "not ready"))
     if len(known) > NAMED_ROWS:
@@ -294,7 +304,12 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> UnitChart | None:
         else "one dot a unit"
     )
     figure = chart(
-        Figure(f"fleet-{sensor}", finding, f"Error on held-out motion, {dots}. {words}", tuple(legend)),
+        Figure(
+            f"fleet-{sensor}",
+            finding,
+            f"Error {judged_on(frame.to_dict('records'), [sensor])}, {dots}. {words}",
+            tuple(legend),
+        ),
         f"Held-out error of {count} units. Median {middle[0]} {unit} before, {middle[1]} after, noise floor "
         f"{middle[2]}. {words}",
         [Panel(layers, f"rms error, {unit}", 200, logarithmic=True)],
