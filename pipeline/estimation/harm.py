@@ -100,17 +100,11 @@ def harmful_on_held_out(names: Sequence[str], errors: Values, time: Values, nois
 
 def fits_of(selection: Selection, left_out: Collection[str] = ()) -> list[JointFit]:
     """Return the fits of the base, without some of its effects, and with each further selected effect."""
-    names = selection.names
-    known = {} if left_out else {len(names): selection.fit, 0: selection.base}
-    base = [term for term in selection.base.terms if term.effect.name not in left_out]
-    of = {term.effect.name: term for term in selection.fit.terms}
-    return [
-        known.get(count)
-        or fit_terms(
-            selection.observations, [*base, *(of[n] for n in names[:count])], selection.fit, selection.settings
-        )
-        for count in range(len(names) + 1)
-    ]
+    names, fit = selection.names, selection.fit
+    known = {} if left_out else {len(names): fit, 0: selection.base}
+    base, of = [t for t in selection.base.terms if t.effect.name not in left_out], {t.effect.name: t for t in fit.terms}
+    terms = [[*base, *(of[name] for name in names[:count])] for count in range(len(names) + 1)]
+    return [known.get(k) or fit_terms(selection.observations, t, fit, selection.settings) for k, t in enumerate(terms)]
 
 
 def harmful_in_turns(selection: Selection, fits: Sequence[JointFit]) -> dict[str, str]:

@@ -19,7 +19,6 @@ from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
 from pipeline.estimation.stages import StageInput
-from pipeline.evaluation.diagnosis import turntable
 
 if TYPE_CHECKING:
     from pipeline.core.records import Recording, UnitRecordings
@@ -48,7 +47,7 @@ def test_what_a_knock_imitates_is_neither_offered_nor_added_where_nothing_is_hel
     noise = estimate_noise("gyroscope", recordings, SETTINGS.sensor.gyroscope)
     observations = observe("gyroscope", recordings, SETTINGS.table)
     selection = select(observations, [], noise, SETTINGS.sensor.gyroscope)
-    harmful = turntable.harmful_effects(selection, harm.fits_of(selection), None, noise)
+    harmful = harm.harmful_in_turns(selection, harm.fits_of(selection))
     assert ("cubic_nonlinearity" in selection.names, "cubic_nonlinearity" in harmful) == (knocked, knocked)
     assert all("stretches of turns that the fit leaves out" in reason for reason in harmful.values())
     added = effects.fit(StageInput("gyroscope", with_noise(recordings, SETTINGS), None, SETTINGS))

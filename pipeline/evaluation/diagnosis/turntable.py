@@ -218,11 +218,10 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     sensor, noise, selection, reported = case.sensor, case.noise, discovery.context, discovery.reported
     observations, unknown = selection.observations, discovery.unknown
     fits = fits_of(reported)
-    motion, floor = _held_out(reported, fits, case)
-    errors = [] if motion is None else np.sqrt(np.mean(np.sum(motion[0][1:] ** 2, 2), 1)).tolist()
+    errors, floor, harmful = _held_out(reported, fits, case)
     suggested = [str(discovery.suggested["name"])] if discovery.suggested else []  # in the base of ``reported``
-    added = fits_of(reported, suggested) if suggested else fits  # the override adds no formula
-    added_held_out = _held_out(reported, added, case)[0] if suggested else motion
+    if suggested:  # the override adds no formula
+        harmful = _held_out(reported, fits_of(reported, suggested), case)[2]
     held_out = None
     if errors and noise is not None:
         held_out = SelectionErrors(errors[0], errors[-1], floor)
@@ -282,7 +281,7 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
         drop_alone=drop_alone,
         excess=excess,
         held_out=errors or [None] * len(fits),
-        harmful=harmful_effects(reported, added, added_held_out, noise),
+        harmful=harmful,
         hidden={**hidden, **alike_with_zeros(reported)},
         unknown=unknown,
         over_noise=_over_noise(selection.base, case, reference),
@@ -311,32 +310,28 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     )
 
 
-def harmful_effects(
-    selection: Selection, fits: Sequence[JointFit], held_out: tuple[Values, Values] | None, noise: Noise | None
-) -> dict[str, str]:
-    """Return the effects that raise the error on held-out motion or, without it, in left-out stretches of the turns."""
-    if held_out is None:
-        return harmful_in_turns(selection, fits)
-    errors, time = held_out
-    return harmful_on_held_out(selection.names, np.delete(errors, 1, axis=0), time, noise or NOISELESS)
-
-
 def _held_out(
     selection: Selection, fits: Sequence[JointFit], case: DiagnosisInput
-) -> tuple[tuple[Values, Values] | None, float]:
-    """Return ``errors_of`` of what effects would replace and of each fit, and the noise floor of the last fit.
+) -> tuple[list[float], float, dict[str, str]]:
+    """Return the held-out error of each fit, the noise floor of the last, and the effects that raise the error.
 
-    The first is the published calibration if it is by a table's motion, else the base. None without held-out motion.
+    Effects are compared with the published calibration if it is by a table's motion, else with the base. Without
+    held-out motion the list is empty, and stretches of the turns that are left out judge the effects.
     """
-    held_out = HeldOutCase(case.calibration, case.recordings, case.noise or NOISELESS, case.settings)
+    noise = case.noise or NOISELESS
+    held_out = HeldOutCase(case.calibration, case.recordings, noise, case.settings)
     samples = held_out.held_out_samples(smoothed=True) if selection.names else []
     if not any(s.known.any() for s in samples):
-        return None, 0.0
+        return [], 0.0, harmful_in_turns(selection, fits)
     calibrations = [calibration_of(fit, selection.observations, None) for fit in fits]
     before = case.calibration if last_fit(case.calibration).reference else calibrations[0]
     errors, time = errors_of([before, *calibrations], samples)
     floor, vector_floor = noise_floors(calibrations[-1], samples)
-    return (errors, time), floor if vector_floor is None or errors.shape[2] == 1 else vector_floor
+    return (
+        np.sqrt(np.mean(np.sum(errors[1:] ** 2, axis=2), axis=1)).tolist(),
+        floor if vector_floor is None or errors.shape[2] == 1 else vector_floor,
+        harmful_on_held_out(selection.names, np.delete(errors, 1, axis=0), time, noise),
+    )
 
 
 def _shares(selection: Selection, name: str) -> dict[str, float]:
