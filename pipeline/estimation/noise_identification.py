@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import scipy
 
-from pipeline.core.records import AXES, SENSOR_UNITS, SENSORS
+from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS
 from pipeline.estimation.noise_search import (
     ONE_SIDED,
     QUANTILE,
@@ -177,10 +177,11 @@ def _source(sensor: str, recordings: Sequence[Recording], *, warm: bool) -> tupl
 
     ``warm``: with the temperatures of static recordings, which only intervals need.
     """
-    known = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
+    found = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
     empty: JSON = {"unit": SENSOR_UNITS[sensor], "source": None, "reason": None, "axes": None}
+    known = [r for r in found if NOISE_OF_ROWS not in r.source and r.kind != "slow"]  # attitudes and movement
     if not known:
-        return empty | {"reason": f"the recordings hold no readings of the {sensor}"}, []
+        return empty | {"reason": f"the recordings hold no readings of the {sensor}{' at rest' * bool(found)}"}, []
     even = [r for r in known if _scatter_of_intervals(r) <= MOST_JITTER]
     if not even:
         reason = f"the sampling intervals scatter by more than {MOST_JITTER:.0%}"

@@ -411,3 +411,26 @@ def test_rows_beyond_the_soaked_temperatures_are_marked_or_refused(tmp_path: Pat
     with pytest.raises(InputError, match=r"2 samples at 5\.0 to 41\.0 degC are beyond the soaked"):
         compensate_log(compensation, log, tmp_path / "refused.csv", strict=True)
     assert not (tmp_path / "refused.csv").exists()
+
+
+@pytest.mark.parametrize("kind", ["attitudes", "slow"])
+def test_differences_between_attitudes_are_no_noise(tmp_path: Path, kind: str) -> None:
+    """They were exported as 4 g/sqrt(Hz), and slow movement as a random walk."""
+    rng = np.random.default_rng(3)
+    angle = np.linspace(0.0, 40.0 * np.pi, 6000)  # through all attitudes on a spiral
+    z = np.linspace(-1.0, 1.0, 6000)
+    up = np.stack([np.sqrt(1.0 - z**2) * np.cos(angle), np.sqrt(1.0 - z**2) * np.sin(angle), z], axis=1)
+    readings = up + 2e-3 * rng.normal(size=up.shape) if kind == "slow" else up[::120]
+    time = np.arange(len(readings))[:, None] / 50.0
+    names = "accel_x_g,accel_y_g,accel_z_g"
+    table, header = (np.hstack([time, readings]), f"time_s,{names}") if kind == "slow" else (readings, names)
+    np.savetxt(tmp_path / "f.csv", table, delimiter=",", header=header, comments="")
+    (tmp_path / "recordings.csv").write_text(f"file,kind\nf.csv,{kind}\n")
+    result = pipeline.calibrate(tmp_path, sensor="mpu6050", procedure="listed")
+    noise = result.calibration["noise"]["accelerometer"]
+    assert noise["axes"] is None
+    assert noise["reason"] == "the recordings hold no readings of the accelerometer at rest"
+    result.save(tmp_path / "out")
+    (text,) = [f.read_text() for f in (tmp_path / "out" / "exports").glob("*/kalibr.yaml")]
+    white = 4e-4 * 9.80665 / np.sqrt(2.0)  # of the sensor file, one-sided
+    assert f"# accelerometer, white: {white:.4g} m/s^2/sqrt(Hz); of the sensor's configuration." in text
