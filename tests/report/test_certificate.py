@@ -142,6 +142,16 @@ def test_the_accuracy_of_gravity_is_asked_for(unit: Unit) -> None:
     assert [m["key"] for m in report["missing"]] == ["table.gravity_accuracy_g"]
 
 
+def test_the_accuracy_of_a_clock_that_can_exceed_the_uncertainty_is_asked_for(unit: Unit) -> None:
+    clock = {"source": "time base", "reason": "table.clock_accuracy_ppm is not stated", "up_to": {"matrix": 0.01}}
+    calibration = copy.deepcopy(unit.calibration)
+    calibration["gyroscope"]["uncertainty_budget"] = {**BUDGET, "not_included": [clock]}
+    report = certificate(calibration, unit.validation, settings_of(unit, STATED), "25.0 to 29.0")
+    assert [(m["what"], m["key"]) for m in report["missing"]] == [
+        ("accuracy of the clock of the gyroscope", "table.clock_accuracy_ppm")
+    ]
+
+
 def test_only_a_table_that_moves_the_item_has_its_mounting_in_the_matrix(unit: Unit) -> None:
     for motion in ("logged", "commanded", "none"):
         page = render("U1", report_of(unit, STATED, motion=motion))

@@ -292,6 +292,8 @@ def _wanted(document: JSON, stated: Certificate) -> Iterator[tuple[str, str, str
         sensor, uncertain = r["name"], any(q["expandedUnc"] for q in r["results"])
         yield f"uncertainty of the {sensor}", "7.8.4.1 a", "method=reference_least_squares", uncertain
         yield f"results of the {sensor} before and after", "7.8.4.1 d", "a held-out recording", r["beforeAdjustment"]
+        if any("clock_accuracy_ppm is" in line or "clock rate" in line for line in r["notInUncertainty"]):
+            yield f"accuracy of the clock of the {sensor}", "7.8.4.1 a", "table.clock_accuracy_ppm", None
     if any(r["conformity"]["checks"] for r in results):
         for what, key in (("specification", "specification"), ("decision rule", "decision_rule")):
             yield what, "7.8.6.2", f"certificate.conformity.{key}", getattr(stated.conformity, key)
