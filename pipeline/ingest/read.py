@@ -29,7 +29,7 @@ import imu_logs
 from imu_logs.files import is_message_log
 from imu_logs.profile import TIME, checks_of, csv_formats
 from imu_logs.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
-from pipeline.core.errors import IngestError, MissingInputError
+from pipeline.core.errors import IngestError, MissingInputError, shortened
 from pipeline.core.records import (
     BETWEEN_ATTITUDES_S,
     NOISE_OF_ROWS,
@@ -109,7 +109,7 @@ def read_recordings(
             recording = replace(recording, notes=(*recording.notes, Note("N-NOTREAD", len(unread), 0, 0, detail)))
         recordings.append(recording)
     if missing:
-        reason = "" if folder.is_dir() else "; the folder does not exist"
+        reason = "" if found else _in_its_place(folder)
         message = f"missing recordings: {'; '.join(missing)}{reason}{of_one_sensor(procedure, found)}"
         refused.insert(0, MissingInputError(message, str(folder)))
     if refused:
@@ -164,6 +164,17 @@ def _of_other_suffix(name: str, entry: RecordingFile, folder: Path) -> str:
     if not others:
         return ""
     return f": {', '.join(others)} lies there; rename it, or set procedure.recordings.{name}.file={others[0]}"
+
+
+def _in_its_place(folder: Path) -> str:
+    """Return what a folder holds that no recording was read from, and what reads it."""
+    if not folder.is_dir():
+        return "; the folder does not exist"
+    names = sorted(f.name for f in folder.iterdir() if f.is_file() and not f.name.startswith("."))
+    if not names:
+        return "; the folder is empty"
+    held = ", ".join(shortened(names, MAX_NAMED_FILES))
+    return f"; the folder holds {held}: python -m pipeline check proposes a profile"
 
 
 def tried(candidates: Sequence[Sequence[str]]) -> str:

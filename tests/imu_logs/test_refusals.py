@@ -176,6 +176,16 @@ def test_missing_folder_is_named(tmp_path: Path, canonical: dict[str, Any]) -> N
         read(tmp_path / "nowhere", canonical)
 
 
+def test_a_folder_without_any_recording_is_told_with_what_it_holds(tmp_path: Path, canonical: dict[str, Any]) -> None:
+    with pytest.raises(MissingInputError, match="; the folder is empty$"):
+        read_recordings(procedure("a"), ingest_of(canonical), SENSOR, tmp_path)
+    for name in ("gyroscope.txt", "accelerometer.txt"):
+        (tmp_path / name).write_text("0 1 2 3\n")
+    said = r"; the folder holds accelerometer\.txt, gyroscope\.txt: python -m pipeline check proposes a profile$"
+    with pytest.raises(MissingInputError, match=said):
+        read_recordings(procedure("a"), ingest_of(canonical), SENSOR, tmp_path)
+
+
 def test_missing_part_is_named(tmp_path: Path) -> None:
     (tmp_path / "accelerometer.txt").write_text("0 1 2 3\n")
     with pytest.raises(MissingInputError, match=re.escape("recording (gyroscope.txt)")):
