@@ -177,7 +177,7 @@ def test_missing_folder_is_named(tmp_path: Path, canonical: dict[str, Any]) -> N
 
 
 def test_a_folder_without_any_recording_is_told_with_what_it_holds(tmp_path: Path, canonical: dict[str, Any]) -> None:
-    with pytest.raises(MissingInputError, match="; the folder is empty$"):
+    with pytest.raises(MissingInputError, match=r"; the folder is empty$"):
         read_recordings(procedure("a"), ingest_of(canonical), SENSOR, tmp_path)
     for name in ("gyroscope.txt", "accelerometer.txt"):
         (tmp_path / name).write_text("0 1 2 3\n")
