@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -429,7 +429,8 @@ def given_calibration(sensor: str, method: Method) -> SensorCalibration:
     Effects of mounting, place, table and timing belong to the bench of that calibration: they are not used, and the
     stage lists them. Raises ``CannotCalibrateError`` if the file has no calibration of the sensor.
     """
-    given = _given(method)
+    given = method.given
+    assert given is not None  # noqa: S101  (``is_given``)
     part, source = given[sensor], given["source"]
     if part is None:
         raise CannotCalibrateError(f"the given calibration {source} holds nothing of the {sensor}")
@@ -458,16 +459,11 @@ def _in_order(fitted: FittedEffect, sensor: str) -> FittedEffect:
 
 def unknown_uncertainty(sensor: str, method: Method) -> dict[str, str]:
     """Return the entry of a budget for a given calibration whose file states no uncertainty; empty if it does."""
-    given = _given(method)
+    given = method.given
+    assert given is not None  # noqa: S101  (``is_given``)
     if given[sensor] is None or given[sensor]["uncertain"]:
         return {}
     return {GIVEN_SOURCE: f"{given['source']} states no uncertainty: none is known, and zeros stand for it"}
-
-
-def _given(method: Method) -> dict[str, Any]:
-    """Return the document of a given calibration."""
-    assert method.given is not None  # noqa: S101  (``is_given``)
-    return method.given
 
 
 def details_on_table(

@@ -26,7 +26,7 @@ from pipeline.physics.effects.base import OF_THE_BIAS, Owner
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.core.records import FittedEffect, SensorCalibration, Values
+    from pipeline.core.records import SensorCalibration, Values
     from pipeline.evaluation.held_out.samples import HeldOutCase, Samples
 
 # part of the matrix, and effects, of the formats in ``pipeline/output/exports/templates``
@@ -68,18 +68,14 @@ def reduced(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) ->
         effects = tuple(e for e in calibration.effects if e.name in kept or e.name not in own)
         partial = replace(calibration, effects=effects)
         if calibration.sensor == "gyroscope":  # effects of the rate have no mean that a rest would have
-            partial = replace(calibration, effects=tuple(e for e in calibration.effects if e in effects or _moving(e)))
+            moving = [e for e in calibration.effects if not effect_of(e).fields("gyroscope", e.values) <= AT_REST_TOO]
+            partial = replace(calibration, effects=tuple(e for e in calibration.effects if e in effects or e in moving))
         left = truth if partial.effects == calibration.effects else _calibrated(partial, fitted)
         bias, matrix = _fitted(calibration, part, left, truth)
         partial = replace(partial, effects=effects)
         error = rms_error_of(replace(partial, bias=bias, matrix=matrix), samples)
         found[part, kept] = Reduced(part, sorted(kept), bias.tolist(), matrix.tolist(), error)
     return list(found.values())
-
-
-def _moving(fitted: FittedEffect) -> bool:
-    """Return whether an effect depends on more than is there at rest."""
-    return not effect_of(fitted).fields("gyroscope", fitted.values) <= AT_REST_TOO
 
 
 def _calibrated(calibration: SensorCalibration, samples: Sequence[Samples]) -> Values:
