@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import csv
+import hashlib
 import importlib.util
 import re
 import sys
@@ -10,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+import yaml
 
 from imu_research.figures import MeasuredFigure
 
@@ -20,15 +23,19 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "evidence.md"
 
 
-@pytest.fixture(scope="module")
-def evidence() -> ModuleType:
-    specification = importlib.util.spec_from_file_location("evidence", ROOT / "benchmarks" / "evidence.py")
+def benchmark(name: str) -> ModuleType:
+    specification = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
     assert specification
     assert specification.loader
     module = importlib.util.module_from_spec(specification)
-    sys.modules["evidence"] = module  # dataclasses look it up
+    sys.modules[name] = module  # dataclasses look it up
     specification.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def evidence() -> ModuleType:
+    return benchmark("evidence")
 
 
 def test_the_page_is_written_from_the_stored_figures(evidence: ModuleType) -> None:
@@ -72,6 +79,27 @@ def test_a_command_that_writes_no_figures_ends_with_its_message(evidence: Module
     options = argparse.Namespace(share=1.0, cores=1)
     with pytest.raises(SystemExit, match=r"wrote no figures:\nno recording"):
         evidence.measured(evidence.Measure("python -c \"print('no recording')\""), options)
+
+
+def test_sets_of_others_are_split_and_an_absent_one_is_named_with_source_and_hash(tmp_path: Path) -> None:
+    real = benchmark("real_recordings")
+    sources = yaml.safe_load((real.SETS / "sources.yaml").read_text())
+    rows = list(csv.DictReader((real.SETS / "units.csv").read_text().splitlines()))
+    assert [row["unit"] for row in rows] == list(sources)
+    for unit, source in sources.items():
+        sheet = list(csv.DictReader((real.SETS / "raw" / unit / "recordings.csv").read_text().splitlines()))
+        assert {row["file"] for row in sheet} == {*source["files"], *(["other.csv"] if "split" in source else [])}
+        digest = next(iter(source["files"].values()))[1]
+        with pytest.raises(SystemExit, match=rf"clone {source['repository']} at {source['commit']} .*{digest}"):
+            real.place(tmp_path, tmp_path, unit, source)
+    text = b"x\n1\n2\n3\n4\n5\n"
+    (tmp_path / "u").mkdir()
+    (tmp_path / "u" / "a").write_bytes(text)
+    (tmp_path / "raw" / "u").mkdir(parents=True)
+    files = {"fit.csv": ["a", hashlib.sha256(text).hexdigest()]}
+    real.place(tmp_path, tmp_path, "u", {"files": files, "split": 2, "header": 1})
+    parts = [(tmp_path / "raw" / "u" / name).read_text().split() for name in ("fit.csv", "other.csv")]
+    assert parts == [["x", "1", "2", "5"], ["x", "3", "4"]]
 
 
 @pytest.mark.evidence
