@@ -168,15 +168,14 @@ class Factor:
     words: str  # a noun phrase
     complexity: int = 2  # its signal and its function
     power: int = 0  # of the signal's unit; 0: without a unit
-    constants: tuple[float, ...] = ()  # scanned, as the formula states them
+    constants: tuple[float, ...] = ()  # scanned
     origin: float = 0.0  # of the signal in an exponential
 
     def values(self, signal: Values) -> Values | None:
         """Return the values of a step or an exponential without parsing its formula; None for other factors."""
         if self.kind == "step":
-            above = signal - self.constants[0]
-            sharp = len(self.constants) == 1
-            return np.heaviside(above, 1.0) if sharp else 0.5 * (1.0 + np.tanh(above / self.constants[1]))
+            above, widths = signal - float(f"{self.constants[0]:.7g}"), self.constants[1:]
+            return 0.5 * (1.0 + np.tanh(above / float(f"{widths[0]:.3g}"))) if widths else np.heaviside(above, 1.0)
         if self.kind in ("exponential", "growth"):
             sign = 1.0 if self.kind == "growth" else -1.0
             return np.asarray(np.exp(sign * (signal - self.origin) / self.constants[0]))
@@ -289,12 +288,12 @@ def harmonic(n: int) -> Factor:
 def step(span: Span, place: float, width: float | None = None) -> Factor:
     """Return a step at a place, sharp or over a width."""
     signal, unit, digits = span.signal, SIGNAL_UNITS[span.signal], 0 if span.signal == "time" else 1
-    words, place = f"a step at {place:.{digits}f} {unit}", float(f"{place:.7g}")
+    words = f"a step at {place:.{digits}f} {unit}"
     if width is None:
         return Factor("step", signal, (f"step({signal} - {place:.7g})",), words, constants=(place,))
-    width = float(f"{width:.3g}")
     soft = f"0.5 * (1 + tanh(({signal} - {place:.7g}) / {width:.3g}))"
-    return Factor("step", signal, (soft,), f"{words}, over about {2 * width:.2g} {unit}", 3, constants=(place, width))
+    over = f"{words}, over about {2 * float(f'{width:.3g}'):.2g} {unit}"
+    return Factor("step", signal, (soft,), over, 3, constants=(place, width))
 
 
 def exponential(span: Span, constant: float, *, growth: bool) -> Factor:
