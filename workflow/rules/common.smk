@@ -34,9 +34,6 @@ from pipeline.core.user_cache import use_cache
 
 use_cache()
 RUNNING = not workflow.is_main_process
-if workflow.local_exec:
-    # Snakemake would import it to store the parameters of rules, which are texts here: 0.2 s.
-    sys.modules.setdefault("pandas", None)
 NO_RUN = {"-n", "-np", "-pn", "--dry-run", "--dryrun", "--unlock", "--report"}
 
 
