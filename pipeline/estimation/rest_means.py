@@ -202,6 +202,9 @@ class Rests:
     share: Values  # (m,); variance of each mean by white noise, over that of a raw sample
     own: Values  # (m,), g^2 or (deg/s)^2; variance of a mean that was recorded as such, whose share is 0
     scatter: Values  # (m, 3); sums of squares about the means
+    before: (
+        Values  # (m, 3); mean reading of the rest before in the recording, also of one that is not used; NaN for none
+    )
     # each (m,), s; start, length and mean time
     start: Values
     length: Values
@@ -374,6 +377,20 @@ def _rests_on_table(recording: Recording, table: Table) -> list[Rest] | None:
     return [Rest(i, i + 1) for i in np.flatnonzero(sound_samples(recording, "accelerometer")).tolist()]
 
 
+def _before(recording: Recording, sensor: str, span: Index) -> Values:
+    """Return the mean reading of the rest before each rest, (m, 3) from its (m, 2) ends; NaN where there is none."""
+    found = np.full((len(span), 3), np.nan)
+    if recording.role not in {ROLE, HELD_OUT} or recording.kind in {ATTITUDES, SOAK}:
+        return found
+    split = split_rests(recording, 0)
+    every = sorted([*split.used, *split.left_out], key=lambda rest: rest.start)
+    means, counts = rest_means(recording, every, sensor)
+    earlier = np.searchsorted([rest.start for rest in every], span[:, 0]) - 1
+    known = (earlier >= 0) & (counts[earlier] > 0) if every else np.zeros(len(span), bool)
+    found[known] = means[earlier[known]]
+    return found
+
+
 def _rests(recording: Recording, sensor: str) -> bool:
     """Return whether a sensor rests: in slow movement, which shows the length of gravity, the gyroscope does not."""
     return sensor == "accelerometer" or recording.kind != "slow"
@@ -405,6 +422,7 @@ def _of_recording(recording: Recording, sensor: str, rests: tuple[Rest, ...]) ->
         "share": share,
         "own": own,
         "scatter": np.array(scatter).reshape(-1, 3),
+        "before": _before(recording, sensor, span),
         "start": start,
         "length": time[span[:, 1] - 1] - start + recording.interval,
         "time": np.array([time[s].mean() for s in inside]),

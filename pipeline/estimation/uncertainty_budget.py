@@ -70,6 +70,7 @@ from pipeline.estimation.candidates import TILT, limits_of, tilt_like_zeros
 from pipeline.estimation.design import EffectColumns, columns_of_samples, joined_motions
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.monte_carlo import through, with_trials
+from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
 from pipeline.estimation.multi_position.model import motion_at_rests
 from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 from pipeline.estimation.turns import RowGroups
@@ -191,7 +192,9 @@ def changes_by_hand(
 
     ``gain``: of ``gain_of``.
     """
-    model = _at_mean_temperature(model)
+    model = copy(_at_mean_temperature(model))
+    if isinstance(model, AccelerometerModel):
+        model.after_moves = True
     warm = bool(np.all(np.isfinite(model.rests.temperature)))
     listed = [
         (this, start, limits)

@@ -148,7 +148,7 @@ def _hidden(part: Mapping[str, Any] | None) -> dict[str, str] | None:
     """Return the effects that are not observable with their reasons; None where the diagnosis failed."""
     if part is None or part.get("failed"):
         return None
-    return {entry["effect"]: entry["reason"] for entry in part["not_observable"]}
+    return {**part.get("open_if_slow", {}), **{entry["effect"]: entry["reason"] for entry in part["not_observable"]}}
 
 
 def not_calibrated(fits: Mapping[str, Fit], validated: Validation, settings: Settings) -> dict[str, str]:

@@ -61,6 +61,7 @@ if TYPE_CHECKING:
 FORCE_ITERATIONS = 12  # of effects that depend on the force
 SETTLED_FORCE_G = 1e-12  # g
 SMALLEST_NOISE = 1e-9  # g
+SAME_ATTITUDE = 1e-3  # rad, and from a half turn: the axis of a move is rounding and noise
 # Of b and the lower triangle of L.
 PARAMETERS = (
     "bias_x", "bias_y", "bias_z", "scale_factor_x", "misalignment_yx", "scale_factor_y", "misalignment_zx",
@@ -162,6 +163,7 @@ class AccelerometerModel:
         self.known_by_limit = {} if known_by_limit is None or faces is not None else known_by_limit
         self.rests_equations = len(rests.time)
         self.stretches = len(rests.time) if wander else 0
+        self.after_moves = False  # whether effects see the direction of the last move (``last_moves``)
 
     def equations(self, state: State, candidates: Sequence[EffectColumns] = ()) -> Equations:
         """Return the linearised equations at given parameters."""
@@ -174,6 +176,8 @@ class AccelerometerModel:
         error = np.sqrt(np.sum(along**2 * variance, axis=1))
         target = np.sqrt(self.gravity**2 + 2.0 * (rests.share * np.mean(self.white**2) + rests.own))
         motion = motion_at_rests(rests, self.gravity * n)
+        if self.after_moves:
+            motion = replace(motion, direction=last_moves(state, rests, n))
         base = np.concatenate([-along, (n[:, :, None] * v[:, None, :]).reshape(-1, 9)], axis=1)
 
         def effect_columns(term: EffectColumns) -> Values:
@@ -253,6 +257,16 @@ class AccelerometerModel:
             known_by_limit=self.known_by_limit,
             soaks=self.soaks,
         )
+
+
+def last_moves(state: State, rests: Rests, up: Values) -> Values:
+    """Return the axis of the shortest move to each rest: (m, 3) unit vectors, zeros where the rest before is unknown.
+
+    A turn by a about e turns gravity in the body, ``up``, by -a: from u to v about ``e = v x u / |v x u|``.
+    """
+    axis = np.cross(up, (rests.before - state.bias) @ state.matrix.T)
+    size = np.linalg.norm(axis, axis=1, keepdims=True)
+    return np.where(size > SAME_ATTITUDE, axis / np.maximum(size, SAME_ATTITUDE), 0.0)
 
 
 def white_of(rests: Rests, noise: Noise | None) -> Values:

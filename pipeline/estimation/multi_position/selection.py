@@ -69,12 +69,22 @@ class CandidateScores:
     scores: dict[str, Score] = field(default_factory=dict)  # of those that the equations show
     # mean gain with its parameters at their limits; infinite without limits
     visible: dict[str, float] = field(default_factory=dict)
+    slowest: dict[str, float] = field(
+        default_factory=dict
+    )  # the smallest of all starts, of effects with time constants
     shown: dict[str, Values] = field(default_factory=dict)  # orthonormal directions under the model's best hypothesis
     spare: dict[str, float] = field(default_factory=dict)  # factor on its gain; 0 with too few equations to judge it
     signal: dict[str, Values] = field(default_factory=dict)  # its fitted, whitened signal there
     # of the linear problem: values at its start, equations with its columns, log L under each hypothesis after a step
     start: dict[str, tuple[EffectColumns, tuple[Equations, Values]]] = field(default_factory=dict)
     fits: dict[str, FitByHand] = field(default_factory=dict)  # of those that were fitted to their optimum
+
+
+def _gain_at(limit: Values, raw: Values) -> float:
+    """Return the mean gain of parameters at their limits, (p,); infinite without limits. ``raw``: (n, p), projected."""
+    size = np.linalg.norm(raw, axis=0)
+    power = float(np.sum((limit[size > 0.0] * size[size > 0.0]) ** 2))
+    return len(raw) * float(np.log1p(power / len(raw)))
 
 
 def fit_configured(  # noqa: PLR0917  (what a fit starts from)
@@ -183,10 +193,16 @@ class SelectionByHand:
         out = CandidateScores()
         for j, term in enumerate(terms):
             name, count = term.effect.name, projected.count(j, at)
-            if count == 0 or adds_nothing(Q, equations.candidates[j]):
+            added, shows = (
+                count + len(term.effect.nonlinear),
+                count > 0 and not adds_nothing(Q, equations.candidates[j]),
+            )
+            factor = projected.correction(j, at, added, equations.scatter) if shows else 0.0
+            seen = factor * _gain_at(self.limits[name], projected.raw[j][at]) if factor > 0.0 else 0.0
+            if term.effect.nonlinear:
+                out.slowest[name] = min(seen, out.slowest.get(name, seen))
+            if not shows:
                 continue
-            added = count + len(term.effect.nonlinear)
-            factor = projected.correction(j, at, added, equations.scatter)
             after = projected.with_candidate(j)
             best = int(np.argmax(after))
             gain = factor * max(2.0 * (float(after[best]) - before), 0.0)
@@ -194,16 +210,14 @@ class SelectionByHand:
             score = replace(score, setting=int(possible[best]), admissible=factor > 0.0)
             if name in out.scores and out.scores[name].delta_bic >= score.delta_bic:
                 continue
-            shown, raw, limit = projected.shown(j, at), projected.raw[j][at], self.limits[name]
+            shown = projected.shown(j, at)
             out.scores[name], out.spare[name], out.shown[name] = score, factor, shown
             effects = [*equations.effects, equations.candidates[j]]
             predicted = self.ceilings.copy()
             predicted[possible] = after
             out.start[name] = term, (replace(equations, effects=effects, candidates=[]), predicted)
             out.signal[name] = shown @ (shown.T @ projected.residual[at])
-            seen = np.linalg.norm(raw, axis=0) > 0.0
-            power = float(np.sum((limit[seen] * np.linalg.norm(raw[:, seen], axis=0)) ** 2))
-            out.visible[name] = factor * len(raw) * float(np.log1p(power / len(raw)))
+            out.visible[name] = seen
         self._refine(out, names, before)
         return out
 

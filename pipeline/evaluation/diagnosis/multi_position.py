@@ -49,7 +49,7 @@ from pipeline.estimation.stages import StageInput, is_given
 from pipeline.evaluation.diagnosis import functional_forms as forms
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.evaluation.diagnosis.method_errors import given_differences
-from pipeline.evaluation.diagnosis.observability import MORE_RESTS, never_shown, not_observable_by_hand
+from pipeline.evaluation.diagnosis.observability import MORE_RESTS, never_shown, not_observable_by_hand, slow_by_hand
 from pipeline.evaluation.diagnosis.residual_dependence import added_variable_of_rests, significant
 from pipeline.evaluation.diagnosis.verdict import verdict_of_selection_by_hand
 from pipeline.evaluation.diagnosis.words import HYSTERESIS, listed, plain
@@ -147,6 +147,7 @@ def findings(case: DiagnosisInput) -> Findings:
                 "unexplained": [],
             },
             "cross_validation": _cross_validation(selection, folds),
+            "open_if_slow": slow_by_hand(selection, hidden),
         },
     )
 

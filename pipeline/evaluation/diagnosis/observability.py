@@ -25,6 +25,7 @@ from pipeline.estimation.candidates import MOUNTING, NO_SWING, ZERO
 from pipeline.estimation.gates import min_gain, passes
 from pipeline.estimation.multi_position.selection import refusal
 from pipeline.physics.effects import catalogue, effect
+from pipeline.physics.effects.formula_effect import FormulaEffect
 from pipeline.physics.signal.filters import MIN_SWING_DEGC, heats_and_cools
 
 if TYPE_CHECKING:
@@ -173,6 +174,19 @@ def not_observable_by_hand(selection: by_hand.SelectionByHand, configured: Seque
     )
 
 
+def slow_by_hand(selection: by_hand.SelectionByHand, hidden: Collection[str]) -> dict[str, str]:
+    """Return the reason for each effect that is observable, but not with its least visible time constant."""
+    n, rests, found = len(selection.fits[0].residual), selection.model.rests, {}
+    for name, least in selection.first.slowest.items():
+        score, this = selection.first.scores.get(name), effect(name)
+        if name in (*hidden, *selection.names) or score is None:
+            continue
+        gate = min_gain(this, selection.model.sensor, score.parameters, n, len(selection.candidates))
+        if least < gate:
+            found[name] = f"with its longest time constant it would hide in the scatter of {len(rests.time)} rests"
+    return found
+
+
 def _steady(span: float) -> str:
     return f"the temperature changes by no more than {span:.2g} degC"
 
@@ -188,7 +202,9 @@ def _reason_by_hand(this: Effect, selection: by_hand.SelectionByHand) -> str:
         return f"{_steady(span)}; it needs {this.excitation}"
     score = selection.first.scores.get(this.name)
     if score is None and model.kinds == 1 and this.needs_motion:
-        return "at rest nothing moves, and it adds nothing"
+        after = "by hand the direction of the last move before a rest is not logged"
+        moved = isinstance(this, FormulaEffect) and "direction" in this.fields(model.sensor, np.zeros(0))
+        return after if moved else "at rest nothing moves, and it adds nothing"
     few = len(base.residual) - base.rank < MIN_FURTHER_EQUATIONS
     if few if score is None else selection.first.spare[this.name] == 0.0:
         return f"{len(model.rests.time)} rests are too few to distinguish it from their scatter; {MORE_RESTS}"
