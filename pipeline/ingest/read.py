@@ -254,7 +254,7 @@ def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | N
 
 
 def _stack(values: dict[str, Values], channels: Sequence[str]) -> Values | None:
-    return np.array([values.pop(c) for c in channels]).T if channels[0] in values else None
+    return np.column_stack([values.pop(c) for c in channels]) if channels[0] in values else None
 
 
 def _check_different(recordings: Sequence[Recording]) -> None:
