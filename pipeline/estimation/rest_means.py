@@ -202,9 +202,7 @@ class Rests:
     share: Values  # (m,); variance of each mean by white noise, over that of a raw sample
     own: Values  # (m,), g^2 or (deg/s)^2; variance of a mean that was recorded as such, whose share is 0
     scatter: Values  # (m, 3); sums of squares about the means
-    before: (
-        Values  # (m, 3); mean reading of the rest before in the recording, also of one that is not used; NaN for none
-    )
+    before: Values  # (m, 3); of the accelerometer, mean of the rest before, also of an unused one; NaN for none
     # each (m,), s; start, length and mean time
     start: Values
     length: Values
@@ -380,8 +378,8 @@ def _rests_on_table(recording: Recording, table: Table) -> list[Rest] | None:
 def _before(recording: Recording, sensor: str, span: Index) -> Values:
     """Return the mean reading of the rest before each rest, (m, 3) from its (m, 2) ends; NaN where there is none."""
     found = np.full((len(span), 3), np.nan)
-    if recording.role not in {ROLE, HELD_OUT} or recording.kind in {ATTITUDES, SOAK}:
-        return found
+    if sensor != "accelerometer" or recording.role not in {ROLE, HELD_OUT} or recording.kind in {ATTITUDES, SOAK}:
+        return found  # hysteresis is the accelerometer's
     split = split_rests(recording, 0)
     every = sorted([*split.used, *split.left_out], key=lambda rest: rest.start)
     means, counts = rest_means(recording, every, sensor)
