@@ -82,7 +82,7 @@ def to_parquet(recordings: Sequence[Recording]) -> bytes:
         found = [columns.get(name) for columns in stored]
         absent = np.repeat([values is None for values in found], samples)
         filled = [np.zeros(n, TYPES[name]) if v is None else v for n, v in zip(samples, found, strict=True)]
-        arrays.append(pa.array(np.concatenate(filled, dtype=TYPES[name]), mask=absent if absent.any() else None))
+        arrays.append(_array(np.concatenate(filled, dtype=TYPES[name]), absent))
     sink = pa.BufferOutputStream()
     parquet.write_table(
         pa.Table.from_arrays(arrays, schema=schema) if recordings else schema.empty_table(),
@@ -94,6 +94,12 @@ def to_parquet(recordings: Sequence[Recording]) -> bytes:
         write_statistics=False,
     )
     return sink.getvalue().to_pybytes()  # type: ignore[no-any-return]
+
+
+def _array(values: NDArray[Any], absent: NDArray[np.bool_]) -> pa.Array:
+    """Return an array, null where ``absent``; of buffers, because ``pa.array`` imports pandas in each job, 0.4 s."""
+    valid = pa.py_buffer(np.packbits(~absent, bitorder="little")) if absent.any() else None
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [valid, pa.py_buffer(values)])
 
 
 def from_parquet(content: bytes, name: str) -> list[Recording]:
