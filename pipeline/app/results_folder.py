@@ -32,20 +32,17 @@ import shutil
 import signal
 import socket
 import stat
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import chain, count
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from types import MappingProxyType
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from pipeline.core.errors import DamagedFileError, PipelineError
 from pipeline.core.files import exchange, flush_file_system, read_json, write_atomically
 from pipeline.core.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch, directory_of
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
-    from pathlib import Path
 
 PUBLISHED_PATHS = (
     "calibrations", "validations", "diagnoses", "reports", "certificates", "exports", "combined", "packs",

@@ -28,14 +28,12 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TextIO
 
 from pipeline.core.errors import shortened
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
 
 # Relative time per unit (gather: per run), from data/demo on two cores (``tests/demo_jobs.csv``); "fit effects": from a
 # bench of three units. The times of diagnoses in one run differ by a factor of 40, so logarithms are averaged.

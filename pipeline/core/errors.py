@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import sys
 import traceback
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from imu_logs.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, InputError, MissingInputError
 from imu_logs.errors import UserError as PipelineError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 __all__ = [
     "UNKNOWN_LAYOUT",

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.abc import InspectLoader, Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, spec_from_file_location
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from types import CodeType, ModuleType
+from types import CodeType, ModuleType
 
 FORMER = {  # name of version 0.1: name now; of a package, with its modules
     "pipeline.commands": "pipeline.app.commands",

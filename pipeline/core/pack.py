@@ -14,17 +14,15 @@ import json
 import os
 import zipfile
 import zlib
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, cast
+from pathlib import Path
+from typing import Any, cast
 
 from imu_logs.units import SENSORS
 from pipeline.core.errors import DamagedFileError
 from pipeline.core.files import WRITE_AGAIN, json_text
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-    from pathlib import Path
 
 Files = dict[str, Any]  # name to bytes, text, or a value that is written as JSON
 COMPRESSION_LEVEL = 1  # of zlib: takes 7.5 ms per MB of pages; level 6 takes 22 ms and saves 17 % (pages of data/demo)

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from imu_logs.units import SENSORS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
 
 WITH_THEM = " (with which U of the "  # between open effects and the uncertainty, in summary.csv and sentences
 MARK_ABOVE_FLOORS = 3.0  # error over noise floor above which a unit is marked, and no verdict is shown as good

@@ -7,14 +7,16 @@ used. The fit is by instrumental variables; ``chips`` has the equations.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy
 
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import MEDIAN_SIZE, SENSORS, Mask, Recording, SensorCalibration, Values, noise_of_steps
+from pipeline.core.settings import Sensor
 from pipeline.estimation.engine import LinearMap, scaled_inverse
 from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.estimation.noise import noise_of, wander_prior
@@ -22,11 +24,6 @@ from pipeline.estimation.observations import BIAS_BLOCKS, SHORTEST_BLOCK_S
 from pipeline.physics.compensation import Compensation
 from pipeline.physics.effects.base import STANDARD_GRAVITY
 from pipeline.physics.kinematics import skew, turn_by_vector
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.settings import Sensor
 
 ChannelValues: TypeAlias = "dict[str, Values]"
 

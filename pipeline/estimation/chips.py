@@ -19,8 +19,9 @@ both chips, so that they cancel as far as the chips' axes agree.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
@@ -52,10 +53,6 @@ from pipeline.estimation.engine import assess_noise, scaled_inverse
 from pipeline.estimation.gauss_markov import WanderPrior
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom, own_and_bench
 from pipeline.physics.kinematics import turn_by_vector
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 OBSERVED = 0.5  # standard uncertainty over that of the prior, above which a parameter is not observable
 ROTATION_DEVIATION_FACTOR = 10.0  # times the standard deviation of the gyroscopes' rotation: a hundredth of the weight

@@ -32,20 +32,21 @@ axis, ``c exp(-x / w)`` or ``c (1 - tanh(x / w))``, x the share of the span from
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import groupby, pairwise, product
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from pipeline.core.errors import InputError, NotObservableError
-from pipeline.core.records import BASE_COUNT, MATRIX_ROWS, motion_at_rest
+from pipeline.core.records import BASE_COUNT, MATRIX_ROWS, Index, Motion, Noise, Values, motion_at_rest
 from pipeline.estimation.engine import LinearMap, ScaledColumns, scaled_inverse
 from pipeline.estimation.gauss_markov import Products, Setting
-from pipeline.estimation.observations import without_rows
+from pipeline.estimation.observations import Observations, RecordingRows, without_rows
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.physics.effects.base import (
     Effect,
@@ -57,13 +58,6 @@ from pipeline.physics.effects.base import (
     truth,
     unit_of,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Sequence
-
-    from pipeline.core.records import Index, Motion, Noise, Values
-    from pipeline.estimation.observations import Observations, RecordingRows
-
 
 REMEMBERED = 4  # motions of a part after effects of timing: of the base, and of terms without their own effect
 # singular value of unit columns that is determined; share of its vector

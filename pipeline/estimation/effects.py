@@ -2,36 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
-from pipeline.core.records import SensorCalibration
+from pipeline.core.records import Noise, Recording, SensorCalibration, UnitRecordings
+from pipeline.core.settings import Settings
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.candidates import AUTO, MOUNTING, configured_effects, limits_of, offered
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.harm import fits_of, harmful_in_turns, left_out, rests_in_turn
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.fit import plausible, require_observable
-from pipeline.estimation.multi_position.model import selection_hypotheses
+from pipeline.estimation.multi_position.model import Model, selection_hypotheses
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import SelectionByHand, fit_configured, refusal
 from pipeline.estimation.noise import with_noises
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import ROLE, is_multi_position
 from pipeline.estimation.selection import select
-from pipeline.estimation.stages import FitStage, StageInput, given_calibration, is_given
+from pipeline.estimation.stages import Change, FitStage, StageInput, given_calibration, is_given
 from pipeline.physics.effects import bench_priors, effect, stated_priors
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.records import Noise, Recording, UnitRecordings
-    from pipeline.core.settings import Settings
-    from pipeline.estimation.multi_position.model import Model
-    from pipeline.estimation.stages import Change
-
 
 ALL: tuple[Change, ...] = ("bias", "matrix", "effects")
 FIT_STAGES = {"effects": FitStage(changes=ALL, accepts=("readings", *ALL), free=True, reference=True)}

@@ -38,9 +38,9 @@ the residual and a column of the Jacobian, which is zero at a minimum (Bates & W
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -48,12 +48,6 @@ import scipy
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import Convergence, Index, Values, noise_of_steps
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting, WanderPrior
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from pipeline.core.records import Values
-
 
 ONE_SIGMA, COVERED = 0.6827, 0.95  # probabilities at which the mixture and Student's t agree
 MIN_DEGREES_OF_FREEDOM = 2.0  # degrees of freedom: Student's t has no variance below

@@ -13,18 +13,15 @@ RSS   : ``y^T M y - y^T M Z (D^-2 + G)^-1 Z^T M y``; nu: readings less columns o
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from pipeline.core.records import Index, Values
 from pipeline.estimation.engine import cholesky
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
-
-    from pipeline.core.records import Index, Values
 
 Pick: TypeAlias = tuple[int, int]  # version and scale of an effect
 # log weight, (m,), mean and standard deviation, (m, k), of the normal components of a mixture

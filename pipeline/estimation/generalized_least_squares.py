@@ -16,9 +16,9 @@ about the noise, weighted by their restricted likelihood.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -42,6 +42,7 @@ from pipeline.core.records import (
     base_values,
     matrix_of,
 )
+from pipeline.core.settings import Settings
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed, parameter_names, require_available, starts_of
 from pipeline.estimation.design import (
     Design,
@@ -68,12 +69,6 @@ from pipeline.estimation.uncertainty_budget import (
 )
 from pipeline.physics.effects.base import Layout, truth
 from pipeline.physics.effects.mounting import Mounting, errors_in_mean_frame, in_mean_frame
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.settings import Settings
-
 
 MAX_ITERATIONS = 25  # of Gauss-Newton
 SMALL_STEP_UNCERTAINTIES = 1e-3  # of a standard uncertainty

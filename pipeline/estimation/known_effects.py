@@ -10,23 +10,30 @@ the sum.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError
-from pipeline.core.records import BASE_NAMES, FittedEffect, MonteCarlo, NotIncluded, motion_at_rest, once_of_log
+from pipeline.core.records import (
+    BASE_NAMES,
+    FittedEffect,
+    MonteCarlo,
+    NotIncluded,
+    Recording,
+    SensorCalibration,
+    StageResult,
+    UnitRecordings,
+    Values,
+    motion_at_rest,
+    once_of_log,
+)
+from pipeline.core.settings import Method
 from pipeline.estimation.uncertainty_budget import with_uncertainty
 from pipeline.physics.effects.base import with_truth
 from pipeline.physics.measurement import SensorEffects, compensate
 from pipeline.physics.signal.filters import temperature_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.records import Recording, SensorCalibration, StageResult, UnitRecordings, Values
-    from pipeline.core.settings import Method
 
 SOURCE = "known effects"  # of the uncertainty budget
 

@@ -14,18 +14,14 @@ The bias is fitted, and that at T_r differs from that at 25 degC by a constant: 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import Coefficient, FittedEffect
+from pipeline.core.settings import DataSheet
 from pipeline.estimation.stages import FitStage
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
-
-if TYPE_CHECKING:
-    from pipeline.core.settings import DataSheet
 
 NAME = "known_temperature"
 

@@ -17,22 +17,17 @@ trials, else two, because the ends of a Monte Carlo interval scatter by 2.7 u / 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from pipeline.core.records import AFTER_BASE, BIAS, MATRIX, MonteCarlo
+from pipeline.core.records import AFTER_BASE, BIAS, MATRIX, Contribution, Mask, MonteCarlo, SensorCalibration, Values
 from pipeline.estimation.engine import ErrorMixture, draw_normal
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from pipeline.core.records import Contribution, Mask, SensorCalibration, Values
-
-    Draw = Callable[[np.random.Generator, int], Values]
+Draw = Callable[[np.random.Generator, int], Values]
 
 SEED = 101  # any number
 BATCH = 500  # trials drawn at a time, which bounds the memory

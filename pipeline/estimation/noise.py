@@ -46,8 +46,8 @@ with ``nu`` degrees of freedom of S, maximised over the white noise at every q a
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -56,13 +56,18 @@ from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.records import (
     NOISE_OF_ROWS,
     SENSORS,
+    Integers,
+    Mask,
     Noise,
     Recording,
+    SensorCalibration,
     UnitRecordings,
+    Values,
     WanderLikelihood,
     median,
     noise_of_steps,
 )
+from pipeline.core.settings import DataSheet, Sensor
 from pipeline.estimation.gauss_markov import (
     MAX_PRIOR_WIDTHS,
     SHARPEST_WIDTH,
@@ -79,12 +84,6 @@ from pipeline.estimation.gauss_markov import (
 from pipeline.physics.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
 from pipeline.physics.signal.quiet_motion import component_along_gravity, creep_of_readings, rounding_of_readings
 from pipeline.physics.signal.rests import rest_readings, stretches_of, usable
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.records import Integers, Mask, SensorCalibration, Values
-    from pipeline.core.settings import DataSheet, Sensor
 
 CHANGING_KINDS = ("soak", "slow")  # kinds of recordings whose readings change slowly by more than noise
 CORRELATION_TIME_FACTORS = np.exp2(np.arange(-6.0, 4.0))  # correlation times of the grid, over that of the sensor file

@@ -15,15 +15,17 @@ while the output of the filter depends on unknown rates.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, TypeVar
-from weakref import ref
+from typing import Any, TypeVar
+from weakref import ReferenceType, ref
 
 import numpy as np
 
-from pipeline.core.records import Same, once_of_log
+from pipeline.core.records import Mask, Motion, Noise, Quantities, Recording, Same, Values, once_of_log
+from pipeline.core.settings import Table
 from pipeline.estimation.gauss_markov import Blocks, constant_bias_s, information
 from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.estimation.turns import RowGroups, reference_valid, rows_of
@@ -32,14 +34,6 @@ from pipeline.physics.effects.base import truth, turning_direction
 from pipeline.physics.kinematics import earth_of, table_motion
 from pipeline.physics.signal.encoder_rate import rate_by_angle
 from pipeline.physics.signal.filters import filtered, impulse_response
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-    from weakref import ReferenceType
-
-    from pipeline.core.records import Mask, Motion, Noise, Quantities, Recording, Values
-    from pipeline.core.settings import Table
-
 
 Result = TypeVar("Result")
 

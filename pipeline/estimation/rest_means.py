@@ -8,13 +8,25 @@ table: dwells of stop-and-go turns, or single samples of continuous turns.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError
-from pipeline.core.records import NOISE_OF_ROWS, RestUse, once
+from pipeline.core.records import (
+    NOISE_OF_ROWS,
+    Index,
+    Integers,
+    Mask,
+    Recording,
+    RestUse,
+    SensorCalibration,
+    Values,
+    once,
+)
+from pipeline.core.settings import Procedure, Settings, Table
 from pipeline.estimation.turns import stop_and_go
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.physics.kinematics import table_motion
@@ -27,12 +39,6 @@ from pipeline.physics.signal.filters import (
 )
 from pipeline.physics.signal.quiet_motion import creep_of_rest, posterior_creep_rates, rounding_of_readings
 from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, usable
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from pipeline.core.records import Index, Integers, Mask, Recording, SensorCalibration, Values
-    from pipeline.core.settings import Procedure, Settings, Table
 
 ROLE, HELD_OUT = "rests", "validation"
 SOAK, ATTITUDES = "soak", "attitudes"  # kinds of recordings in the sheet; times of attitudes do not count

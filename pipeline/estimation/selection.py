@@ -13,14 +13,16 @@ that of a static recording or of the sensor file, two effects may mask each othe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import Noise, SensorCalibration, Values
+from pipeline.core.settings import DataSheet
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
 from pipeline.estimation.design import EffectColumns, Start, ordinary_base, placed, without_unknown_motion
 from pipeline.estimation.engine import scaled_inverse
@@ -30,13 +32,6 @@ from pipeline.estimation.generalized_least_squares import JointFit, fit_best, fi
 from pipeline.estimation.observations import Observations, weighted
 from pipeline.estimation.ranking import Ranking, Score
 from pipeline.physics.effects import effect
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.records import Noise, SensorCalibration, Values
-    from pipeline.core.settings import DataSheet
-
 
 MAX_SELECTED_EFFECTS = 5  # effects that one selection adds
 INFLATED = 3.0  # times the expected wander, see above

@@ -18,8 +18,8 @@ elements of the matrix, in the sensor's unit for the bias.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,8 +34,10 @@ from pipeline.core.records import (
     NotIncluded,
     Recording,
     SensorCalibration,
+    UnitRecordings,
     Values,
 )
+from pipeline.core.settings import DataSheet, Settings, Table
 from pipeline.estimation.table_errors import TIME_BASE, type_b
 from pipeline.estimation.uncertainty_budget import (
     GRAVITY,
@@ -47,12 +49,6 @@ from pipeline.estimation.uncertainty_budget import (
 from pipeline.physics.effects.base import OF_THE_BIAS
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.signal.filters import temperature_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.records import UnitRecordings
-    from pipeline.core.settings import DataSheet, Settings, Table
 
 FITTED = {"bias": OF_THE_BIAS, "scale_factor": ("scale_factor_temperature",)}
 BURSTS = "interval of bursts"

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError
-from pipeline.estimation.engine import ScaledColumns
+from pipeline.core.records import Index, Mask, Motion, Recording, Values
+from pipeline.core.settings import Table
+from pipeline.estimation.engine import ResidualNoise, ScaledColumns
 from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.physics.kinematics import table_motion
 from pipeline.physics.signal.rests import RATE_AT_REST_DPS, runs
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from pipeline.core.records import Index, Mask, Motion, Recording, Values
-    from pipeline.core.settings import Table
-    from pipeline.estimation.engine import ResidualNoise
-
 
 FIT_BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
 DISTINCT_DIRECTION_G = 0.01  # attitudes 0.6 deg apart differ

@@ -8,12 +8,15 @@ double, null in the rows of recordings without it. The file is a member of a pac
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from pyarrow import parquet
 
 import imu_logs
@@ -22,13 +25,6 @@ from imu_logs.text_write import to_numpy
 from imu_logs.units import ACCELEROMETER, ATTITUDE, CHANNELS, GYROSCOPE
 from pipeline.core.errors import InputError
 from pipeline.core.records import Note, Recording
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
 
 BLOCKS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE, "table_attitude": ATTITUDE}
 SINGLES = ("temperature", "table_angle", "table_rate", "flags")

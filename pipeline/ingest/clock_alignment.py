@@ -32,21 +32,15 @@ components.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imu_logs.log import Log, Note
 from imu_logs.units import ATTITUDE, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError
-from pipeline.core.records import conjugate_product, continuous, level_in_body
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.core.records import Mask, Values
-
+from pipeline.core.records import Mask, Values, conjugate_product, continuous, level_in_body
 
 ENCODER_STEP_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
 MOST_POINTS = 1 << 18  # bounds memory and the cost of correlation; a power of 2 for the transform

@@ -12,22 +12,16 @@ moves may have any length. Lost steps of the motors are not observable; they are
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imu_logs.log import Log
 from imu_logs.units import TRIADS
-from pipeline.core.records import Note
+from pipeline.core.records import Index, Note, Values
 from pipeline.core.settings import ProgramRest, ProgramTurn, Repeated
 from pipeline.ingest.clock_alignment import fit_clocks, seconds_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from pipeline.core.records import Index, Values
-
 
 PROGRAM_STEP_S = 0.005  # grid of the program and of its derivative, half the interval of a log at 100 Hz
 BEFORE_S = 1.0  # rest that is added at both ends

@@ -26,8 +26,8 @@ with ``nu = 3 (n - 1)``, m the mean of the piece and s the median scatter of an 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,6 +35,10 @@ from imu_logs.units import STANDARD_GRAVITY
 from pipeline.core.records import (
     MEDIAN_SIZE,
     SENSOR_UNITS,
+    Index,
+    Note,
+    Recording,
+    Values,
     conjugate_product,
     continuous,
     level_in_body,
@@ -42,12 +46,6 @@ from pipeline.core.records import (
     noise_of_steps,
 )
 from pipeline.ingest.quality_flags import GAP
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.core.records import Index, Note, Recording, Values
-
 
 # 10 and 7 standard deviations: below 3e-12 by chance for normal noise; half of L as a margin.
 MAX_DEVIATIONS, ALLOWED, JUMP = 10.0, 1.5, 7.0

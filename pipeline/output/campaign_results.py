@@ -9,11 +9,11 @@ figures in deg/s; parameters have a column with their unit.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pandas as pd
 
@@ -22,9 +22,6 @@ from pipeline.core.files import JSON, read_json, text_of_cell
 from pipeline.core.pack import DOCUMENT_FOLDERS, read_published
 from pipeline.core.records import SENSORS
 from pipeline.output.pages.parameters import SUMMARY_COLUMNS, fitted_parameters, reading_errors
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 COLUMNS_OF_PARAMETERS = (
     "parameter",

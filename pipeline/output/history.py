@@ -19,9 +19,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,10 +31,6 @@ from imu_logs.units import SENSORS
 from pipeline.core.errors import InputError, shortened
 from pipeline.core.files import JSON, write_json
 from pipeline.core.verdicts import Error, error_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
 HISTORY_FOLDER = "history"
 VALUES = "values"  # key of a state: the values of each configuration section

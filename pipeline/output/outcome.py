@@ -12,8 +12,9 @@ import math
 import re
 import shlex
 from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from imu_logs.units import SENSORS
 from pipeline.core.errors import shortened
@@ -24,6 +25,8 @@ from pipeline.core.verdicts import (
     READY,
     SETTING,
     WITH_THEM,
+    Problem,
+    RowState,
     Verdict,
     decided_words,
     largest_over_noise,
@@ -32,12 +35,7 @@ from pipeline.core.verdicts import (
 )
 from pipeline.output.history import difference, dropped, errors_of, of_units, read_history
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from pipeline.core.verdicts import Problem, RowState
-
-    Ways = Sequence[Sequence[str]]
+Ways = Sequence[Sequence[str]]
 
 SENSOR_UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 ZERO_SETTING = re.compile(r"(?<=zero_deg=)-?[0-9.]+")

@@ -7,13 +7,27 @@ the file, the key, its value and what was expected.
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any, NoReturn
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
 
 from imu_logs.files import not_regular
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.core.files import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
+from pipeline.core.files import (
+    Check,
+    WrongValueError,
+    each,
+    fields,
+    flag,
+    items,
+    mapping,
+    number,
+    one_of,
+    or_none,
+    text,
+)
 from pipeline.core.pack import read_published
 from pipeline.core.records import (
     AXES,
@@ -25,14 +39,6 @@ from pipeline.core.records import (
     Values,
 )
 from pipeline.physics.effects import effect_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from pipeline.core.files import Check
-    from pipeline.core.records import Values
-
 
 # Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
 # (2 to 32 g), 32 between those of a gyroscope (125 to 4000 deg/s), 57 for rad/s, 1000 for mg and mdps.

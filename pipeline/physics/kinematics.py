@@ -33,9 +33,9 @@ both ends, and the acceleration from the five nearest rates.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -52,15 +52,10 @@ from pipeline.core.records import (
     median,
     once_of_log,
 )
+from pipeline.core.settings import Table
 from pipeline.physics.signal.encoder_rate import rate_by_angle, step_of
 from pipeline.physics.signal.filters import temperature_of, temperature_rate_of
 from pipeline.physics.signal.rests import still_samples
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.core.settings import Table
-
 
 TIGHTEST_DEG, LOOSEST_DEG = 1e-5, 1e-3  # a good encoder's resolution; 17 ug of specific force
 GENTLE_DEG, EXACT_DEG = 1e-4, 1e-6  # smooth motion, where no bend is looked for; and an interval without any

@@ -31,25 +31,19 @@ The samples add their terms one by one; where a stretch begins, the sums are mov
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, ConvergenceError, InputError
-from pipeline.core.records import FittedEffect, Motion, Values
+from pipeline.core.records import FittedEffect, Mask, Motion, SensorCalibration, Values
 from pipeline.physics.effects import effect_of, owner_of
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Effect, Owner, truth, turning_direction, with_truth
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    Known = tuple[float, Values]  # the last sample that is not missing: time in s, value
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.core.records import FittedEffect, Mask, SensorCalibration, Values
-
-    Truths = dict[str, Values]
+Known = tuple[float, Values]  # the last sample that is not missing: time in s, value
+Truths = dict[str, Values]
 
 
 MAX_INVERSION_ITERATIONS = 60  # two digits a round: far more than 1e-13 needs

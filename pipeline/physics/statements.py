@@ -34,7 +34,8 @@ Earth's rotation and the sensor's clock are such effects where the budget does n
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -54,16 +55,10 @@ from pipeline.core.records import (
     base_values,
     matrix_of,
 )
+from pipeline.core.settings import DataSheet
 from pipeline.core.verdicts import WITH_THEM
 from pipeline.physics.effects import effect, effect_of
 from pipeline.physics.effects.base import parameter_limits
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from pipeline.core.records import Values
-    from pipeline.core.settings import DataSheet
-
 
 DIFFERENT = 1.1  # ratio of both uncertainties above which pages, terminal and certificate state both
 NAMED_EFFECTS = 4  # in a sentence

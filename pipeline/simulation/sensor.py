@@ -44,30 +44,24 @@ in the catalogue of a diagnosis.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.records import SENSORS, Motion
+from pipeline.core.records import SENSORS, Motion, Values
+from pipeline.core.settings import DataSheet, Sensor
 from pipeline.physics.effects import effect, effect_from
-from pipeline.physics.effects.base import STANDARD_GRAVITY, parameter_limits, truth
+from pipeline.physics.effects.base import STANDARD_GRAVITY, Effect, parameter_limits, truth
 from pipeline.physics.signal.filters import rate_of_change
 from pipeline.physics.signal.rests import still_samples
-from pipeline.simulation.trajectory import CommandedTurns, mounted, rotation_about, rotation_by
+from pipeline.simulation.trajectory import CommandedTurns, Gimbals, RestsAndMoves, mounted, rotation_about, rotation_by
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from pipeline.core.records import Values
-    from pipeline.core.settings import DataSheet, Sensor
-    from pipeline.physics.effects.base import Effect
-    from pipeline.simulation.trajectory import Gimbals, RestsAndMoves
-
-    Alteration = Callable[["Scene", Values], "Scene"]
-    Hidden = dict[str, tuple[Effect, Values]]  # by name: an effect and the values of its parameters
+Alteration = Callable[["Scene", Values], "Scene"]
+Hidden = dict[str, tuple[Effect, Values]]  # by name: an effect and the values of its parameters
 
 # Edges of the panels in time constants: exp(-20) is 2e-9. The rule: nodes s and weights of the integral of
 # ``exp(-s) u(s)``, two a panel; the weights sum to 1.

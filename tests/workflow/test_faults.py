@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator  # noqa: TC003  (pytest looks at annotations)
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 

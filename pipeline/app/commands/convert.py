@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from imu_logs.yaml_file import read_yaml
 from pipeline.app.commands import parser_of
@@ -16,9 +16,6 @@ from pipeline.core.records import SENSORS
 from pipeline.output.exports import formats
 from pipeline.output.exports.reading import CALIBRATION, ImportedCalibration, convert, counts_of, format_of, read_any
 from pipeline.output.exports.sensors import SensorFigures
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 EPILOG = """\
 The format of IN follows from its name and content, the format of OUT from its name: kalibr.yaml, px4.params,

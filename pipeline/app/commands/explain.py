@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pipeline.app.commands import parser_of
 from pipeline.app.commands.convert import sensor_figures
@@ -20,6 +21,7 @@ from pipeline.core.verdicts import (
     KINDS,
     MARK_ABOVE_FLOORS,
     MARK_AFTER_MOVES,
+    Problem,
     Verdict,
     error_of,
     moves_over_noise,
@@ -44,11 +46,6 @@ from pipeline.output.outcome import (
 )
 from pipeline.output.pages.pages import template
 from pipeline.physics.statements import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.verdicts import Problem
 
 MOST_ROWS = 24  # of an overview: those of a terminal
 MIN_TEXT_COLUMNS = 40  # columns, below which lines are not wrapped further

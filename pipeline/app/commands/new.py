@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.app.commands import parser_of
 from pipeline.app.planning.plan import readme
 from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.files import CONFIGS
 from pipeline.core.records import SENSOR_UNITS, SENSORS
-from pipeline.core.settings import settings_of_ranges
+from pipeline.core.settings import DataSheet, Table, settings_of_ranges
 from pipeline.ingest.recordings_sheet import EXAMPLE
 from pipeline.output.outcome import run_command
 from pipeline.output.pages.pages import template
 from pipeline.simulation.description import TABLE_PROCEDURES, UnitDescription, described, read_option, shipped_settings
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.settings import DataSheet, Table
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.app.commands import parser_of
 from pipeline.app.commands.readings import Reading, config_of_log
@@ -16,9 +16,6 @@ from pipeline.output.exports import ExportedUnit, export, formats
 from pipeline.output.exports.sensors import SensorFigures
 from pipeline.output.pages.held_out_section import remarks, term_rows
 from pipeline.output.pages.pages import MINUS, aligned, number
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 EPILOG = """\
 The unit must rest during the whole log. The slow terms need hours; for a term that needs a longer log, an upper limit

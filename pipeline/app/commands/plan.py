@@ -5,20 +5,17 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pipeline.app.commands import parser_of
 from pipeline.app.planning.plan import WIDTH, PlanGain, best_changes, helps_most, plan_of, plan_text
 from pipeline.core.errors import ConfigurationError
 from pipeline.physics.effects import read_effect_files, register
 from pipeline.simulation.description import UnitDescription, add_recording_options, described, read_description
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 DESCRIPTION_FILE = "simulation.yaml"
 EPILOG = """\

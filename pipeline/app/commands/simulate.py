@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
@@ -27,9 +28,6 @@ from pipeline.simulation.description import (
     read_description,
     shipped_settings,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 DESCRIPTION_FILE = "simulation.yaml"
 EPILOG = """\

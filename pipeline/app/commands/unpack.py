@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.app.commands import parser_of
 from pipeline.app.config.campaign import find_campaign
@@ -25,9 +25,6 @@ from pipeline.core.files import flushed_together, write_atomically
 from pipeline.core.pack import PACKS, batches_of
 from pipeline.output.history import read_history
 from pipeline.output.pages.pages import linked
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 EPILOG = """\
 Above publish_limit units a run publishes no files of single units (docs/fleet.md). This command publishes them for the

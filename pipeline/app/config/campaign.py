@@ -26,30 +26,25 @@ import hashlib
 import math
 import os
 import unicodedata
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import ValidationError
 
 from imu_logs.units import SENSORS
 from pipeline.app.config.compose import Composer
-from pipeline.app.config.layers import as_list, load_layers
+from pipeline.app.config.layers import Layers, as_list, load_layers
 from pipeline.app.config.options import GROUPS, PYTHON, RUN_SETTINGS, SettingProblem, mapping_of, nearest, parse
 from pipeline.app.config.stage_settings import last_stage
 from pipeline.core.errors import ConfigurationError, shortened
 from pipeline.core.files import CONFIGS, JSON, SHIPPED, canonical_json
-from pipeline.core.settings import RunSettings
+from pipeline.core.settings import RunSettings, Settings
 from pipeline.unit import EFFECTS_STAGE
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.app.config.layers import Layers
-    from pipeline.core.settings import Settings
-
-    SheetRows = Mapping[str, Mapping[str, str]]  # unit to its cells by column
+SheetRows = Mapping[str, Mapping[str, str]]  # unit to its cells by column
 
 TAKE_OVER = "take_over"
 SMALLEST_BATCH, LARGEST_BATCH = 25, 160  # units: a job takes some seconds, as its start does; a minute, to fill cores

@@ -14,11 +14,12 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 from pydantic import ValidationError
 
@@ -62,9 +63,6 @@ from pipeline.core.user_cache import from_cache, to_cache
 from pipeline.estimation.stages import NOT_WANTED, check_stages, declared
 from pipeline.ingest.files import candidate_files
 from pipeline.ingest.recordings_sheet import with_sheet
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
 
 Groups: TypeAlias = tuple[tuple[str, str], ...]  # group and option
 INSTANCE = "${ingest.instance}"

@@ -26,8 +26,10 @@ import difflib
 import io
 import os
 import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
@@ -45,10 +47,6 @@ from pipeline.app.config.options import (
 )
 from pipeline.core.errors import ConfigurationError, shortened
 from pipeline.ingest.files import wrong_name
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
 
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")  # all except tab and line ends
 KNOWN_COLUMNS = ("unit", "overrides", *GROUPS, "serial", "lot", "date", "board")

@@ -15,10 +15,12 @@ import hashlib
 import json
 import os
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from pipeline.app.config.campaign import load_campaign
+from pipeline.app.config.campaign import Campaign, load_campaign
 from pipeline.app.results_folder import (
     BESIDE,
     NEW_FOLDER,
@@ -40,12 +42,6 @@ from pipeline.core.errors import PipelineError, shortened
 from pipeline.core.files import read_json
 from pipeline.core.pack import Pack, read_published
 from pipeline.ingest.files import digests_in_pack, digests_of_entries, digests_of_files
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from pipeline.app.config.campaign import Campaign
 
 
 class OtherCampaignError(PipelineError):

@@ -19,23 +19,17 @@ import os
 import re
 import shutil
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imu_logs.files import GIT_LFS, MESSAGE_FORMATS, not_regular
 from pipeline.app.field_logs.stream import CalibratedStretch, LogProfile, LogStream, Output, Result, user_errors
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.physics.compensation import SMOOTHING_S
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from pipeline.physics.compensation import Compensation
-
+from pipeline.physics.compensation import SMOOTHING_S, Compensation
 
 BLOCK_BYTES = 1 << 21  # of a text log: 20,000 rows, whose arrays take about 10 MB
 DESCRIPTOR = re.compile(r"-|/dev/stdout|(?:/dev/fd|/proc/self/fd)/(\d+)")  # files that are already open

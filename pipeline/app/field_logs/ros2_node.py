@@ -13,9 +13,10 @@ from __future__ import annotations
 import argparse
 import copy
 import sys
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -26,9 +27,6 @@ from pipeline.ingest.axis_maps import axis_matrix, maps_of_log
 from pipeline.physics.calibration_file import read_calibration
 from pipeline.physics.compensation import SMOOTHING_S, load
 from pipeline.physics.measurement import ExponentialRegression
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 # Sensor to the field of the message, its covariance, and its unit in g or deg/s.
 FIELDS = {sensor: (vector, f"{vector}_covariance", 1.0 / one) for vector, (sensor, _unit, one) in VECTORS.items()}

@@ -42,15 +42,16 @@ where
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations, product
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import AXES, BIAS, NotCalibrated, Recording, SensorCalibration, Values, coverage_factor
+from pipeline.core.settings import DataSheet, Procedure, Settings
 from pipeline.estimation.accelerometer.nonlinear_least_squares import IDEAL, LOWER_COLUMNS, LOWER_ROWS, PLACE, triangle
 from pipeline.estimation.multi_position.accelerometer import limit_of_misalignment
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
@@ -59,14 +60,7 @@ from pipeline.estimation.rest_means import ROLE, Orientations, holdout_interval,
 from pipeline.physics.signal.rests import WINDOW_S, Rest, find_rests
 from pipeline.physics.signal.segments import multiples, turns_by_hand
 from pipeline.simulation.trajectory import rotation_by
-from pipeline.unit import Task, run_checked, run_steps
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.settings import DataSheet, Procedure, Settings
-    from pipeline.unit import UnitState
-
+from pipeline.unit import Task, UnitState, run_checked, run_steps
 
 SHARPNESS = 8  # exponent of a smooth norm for the largest U, within 32 % of it for nine parameters
 SWEEPS = 10  # of the exchange, which usually ends after two or three

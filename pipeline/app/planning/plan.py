@@ -20,17 +20,18 @@ and lengths are those of the simulated procedure.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pipeline.app.planning.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
 from pipeline.core.errors import NotObservableError
-from pipeline.core.records import AXES, SENSORS, Noise, NotCalibrated, Recording, SensorCalibration
-from pipeline.core.settings import assumed_figures
+from pipeline.core.records import AXES, SENSORS, Fit, Noise, NotCalibrated, Recording, SensorCalibration
+from pipeline.core.settings import DataSheet, Settings, assumed_figures
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
@@ -55,13 +56,6 @@ from pipeline.simulation.description import (
 )
 from pipeline.simulation.trajectory import Gimbals, Planned, random_gimbals
 from pipeline.unit import run_checked
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
-
-    from pipeline.core.records import Fit
-    from pipeline.core.settings import DataSheet, Settings
-
 
 WIDTH = 100  # columns of a plan on the terminal
 CLEARLY_LARGER = 1.2  # times the smallest size: least size of a named effect that is printed

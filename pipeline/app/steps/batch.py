@@ -14,12 +14,14 @@ import argparse
 import hashlib
 import json
 import sys
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any
 
 from pipeline.app.results_folder import hold_as_job, record_written, repetitions
 from pipeline.app.steps import MODULES
@@ -28,10 +30,6 @@ from pipeline.core.files import read_json, write_json
 from pipeline.core.pack import FAILED_SUFFIX, INCOMPLETE_SUFFIX, Files, Pack, as_bytes, new_pack
 from pipeline.core.settings import Settings, UserEffectFiles
 from pipeline.unit import EFFECTS_STAGE, STEPS, Task, run_step
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from types import ModuleType
 
 FITS = ("accelerometer", "gyroscope")
 INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from pipeline.core.settings import Settings
 from pipeline.output.exports import exports
-
-if TYPE_CHECKING:
-    from pipeline.core.settings import Settings
 
 
 def export(

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from pipeline.core.records import Recording, UnitRecordings
+from pipeline.core.settings import Settings
 from pipeline.estimation.noise import with_noises
 from pipeline.physics.signal.filters import apply_filter
-
-if TYPE_CHECKING:
-    from pipeline.core.records import Recording, UnitRecordings
-    from pipeline.core.settings import Settings
 
 
 def filter_recordings(checked: list[Recording], settings: Settings) -> UnitRecordings:

@@ -9,14 +9,12 @@ from __future__ import annotations
 import os
 import socket
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 from pipeline.app.steps import MODULES
 from pipeline.app.steps.job_command import ADDRESS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 COMMAND = [sys.executable, "-PS", str(Path(__file__).with_name("job_command.py"))]  # imports no package
 # glibc returns freed memory to the system by default, which clears it when it is used again: 8 % of the stages' time.

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from contextlib import suppress
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pipeline.app.steps.batch import record_output
+from pipeline.app.steps.batch import Job, record_output
 from pipeline.app.steps.summary import failed_files
 from pipeline.app.steps.unit_files import StoredUnit
 from pipeline.app.steps.validate import held_out_errors
 from pipeline.core.errors import DamagedFileError
-from pipeline.core.pack import DOCUMENT_FOLDERS, STAGE_OF, Pack, as_bytes, new_pack
+from pipeline.core.pack import DOCUMENT_FOLDERS, STAGE_OF, Files, Pack, as_bytes, new_pack
 from pipeline.core.records import SENSORS, Validation, fit_from_json
+from pipeline.core.settings import Settings
 from pipeline.output.exports import exports
 from pipeline.output.pages.combined import UnitEstimate, UnitPrior, calibration_with_prior, priors_of, with_card
-
-if TYPE_CHECKING:
-    from pipeline.app.steps.batch import Job
-    from pipeline.core.pack import Files
-    from pipeline.core.settings import Settings
 
 LOTS_FILE = "told.json"  # description of the lots for ``fleet.json``
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
-from pipeline.core.records import SensorValidation, Validation, calibrated
+from pipeline.core.records import Fit, SensorValidation, UnitRecordings, Validation, calibrated
+from pipeline.core.settings import Settings
 from pipeline.estimation.noise import required_noises
 from pipeline.evaluation.held_out.attitude import attitude, gravity_direction, turn_departures
 from pipeline.evaluation.held_out.samples import OTHER_SENSOR
 from pipeline.evaluation.held_out.validation import validate
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.core.records import Fit, UnitRecordings
-    from pipeline.core.settings import Settings
 
 
 def validate_unit(unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings) -> Validation:

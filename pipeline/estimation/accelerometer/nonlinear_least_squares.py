@@ -18,9 +18,9 @@ is linear in p; its centre is ``b = -Q^-1 h``, and ``L^T L = Q G^2 / (1 + b^T Q 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -43,6 +43,7 @@ from pipeline.core.records import (
     base_values,
     coverage_factor,
 )
+from pipeline.core.settings import DataSheet, Settings
 from pipeline.estimation.engine import LinearMap, ScaledColumns
 from pipeline.estimation.gauss_markov import WHITE_SETTING, WanderPrior
 from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
@@ -76,12 +77,6 @@ from pipeline.estimation.uncertainty_budget import (
     stage_parameters,
 )
 from pipeline.physics.kinematics import table_motion
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.core.settings import DataSheet, Settings
-
 
 NAME = "nonlinear_least_squares"
 FIT_STAGES = {NAME: FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("bias", "matrix"), free=True)}

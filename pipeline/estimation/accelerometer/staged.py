@@ -20,9 +20,9 @@ then follows from synthetic turns, which are the fitted sinusoids with simulated
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -45,6 +45,7 @@ from pipeline.core.records import (
     base_values,
     corrected,
 )
+from pipeline.core.settings import Settings
 from pipeline.estimation.accelerometer.turn_extremes import (
     AxisTurns,
     Extremes,
@@ -69,12 +70,8 @@ from pipeline.estimation.uncertainty_budget import (
 )
 from pipeline.physics.effects import effect
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    Quantities = dict[str, tuple[float, str]]  # value and unit of each parameter
-    Outcome = tuple[list[CorrectionStep], Quantities]  # steps of the correction by a stage, and its parameters
-    from pipeline.core.settings import Settings
+NamedValues = dict[str, tuple[float, str]]  # value and unit of each parameter
+EstimatedSteps = tuple[list[CorrectionStep], NamedValues]  # steps of the correction by a stage, and its parameters
 
 REPLICATES = 60  # synthetic turns: their covariance is known to a tenth
 SEED = 20190508  # any number
@@ -90,11 +87,11 @@ FIT_STAGES = {
 }
 
 
-def _per_axis(name: str, values: Values, unit: str) -> Quantities:
+def _per_axis(name: str, values: Values, unit: str) -> NamedValues:
     return {f"{name}_{axis}": (float(value), unit) for axis, value in zip(AXES, values, strict=True)}
 
 
-def _angles(sides: Mapping[str, Values]) -> Quantities:
+def _angles(sides: Mapping[str, Values]) -> NamedValues:
     return {
         f"{name}_{side}": (float(angle), "deg")
         for side, degrees in sides.items()
@@ -102,7 +99,7 @@ def _angles(sides: Mapping[str, Values]) -> Quantities:
     }
 
 
-def orthogonality(extremes: Extremes) -> Outcome:
+def orthogonality(extremes: Extremes) -> EstimatedSteps:
     """Return the factors of orthogonality (3.15-3.29).
 
     In turns about x, y, z the upper extremes of the two other axes should be 90 deg apart; their excesses are
@@ -130,7 +127,7 @@ def orthogonality(extremes: Extremes) -> Outcome:
     return [TwoSided(positive, negative, switch_at)], values
 
 
-def misalignment(extremes: Extremes) -> Outcome:
+def misalignment(extremes: Extremes) -> EstimatedSteps:
     """Return the factors of misalignment (3.30-3.37).
 
     While the table turns about an axis, that axis should stay level. Its reading gives the angle
@@ -164,13 +161,13 @@ def misalignment(extremes: Extremes) -> Outcome:
     return [TwoSided(positive, negative, switch_at)], values
 
 
-def bias(extremes: Extremes) -> Outcome:
+def bias(extremes: Extremes) -> EstimatedSteps:
     """Return the bias (3.38-3.39): ``a_bi = a_mis - b``, b = a_zero, the mean reading of each axis where level."""
     b = extremes.a_zero
     return [Subtract(b)], _per_axis("b", b, "g")
 
 
-def scale_factor(extremes: Extremes) -> Outcome:
+def scale_factor(extremes: Extremes) -> EstimatedSteps:
     """Return a scale factor for each side (3.40-3.43).
 
         S_P = G / (a_max - a_zero),   S_N = G / |a_min - a_zero|,   a_sc = a_bi S
@@ -199,7 +196,7 @@ class CorrectedForces:
     bias: Values = field(default_factory=lambda: np.zeros(3))
     positive: Values = field(default_factory=lambda: np.ones(3))
     negative: Values = field(default_factory=lambda: np.ones(3))
-    values: Quantities = field(default_factory=dict)
+    values: NamedValues = field(default_factory=dict)
 
     @classmethod
     def of(cls, previous: SensorCalibration | None) -> CorrectedForces:

@@ -31,8 +31,9 @@ rest at either end, so that one sinusoid does not describe both.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 
@@ -40,10 +41,6 @@ from pipeline.core.errors import NotObservableError
 from pipeline.core.records import AXES, Convergence, CorrectionStep, Mask, TwoSided, Values
 from pipeline.estimation.engine import ScaledColumns, linear_convergence
 from pipeline.estimation.turns import TurnPart, filtered_alike
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 PHASE_ITERATIONS = 12  # of the phase
 SAME_PHASE = 1e-12  # rad

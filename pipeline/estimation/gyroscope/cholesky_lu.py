@@ -31,9 +31,10 @@ output of a filter still changes. Turns of a sheet have U by their known angles 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,8 +52,10 @@ from pipeline.core.records import (
     StageDetails,
     StageResult,
     Subtract,
+    UnitRecordings,
     Values,
 )
+from pipeline.core.settings import Settings, Table
 from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative, linear_convergence
 from pipeline.estimation.gyroscope.known_turns import covariances, known_turns, with_budget
 from pipeline.estimation.monte_carlo import with_matrix
@@ -63,13 +66,6 @@ from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
 from pipeline.physics.signal.rests import runs
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.records import UnitRecordings
-    from pipeline.core.settings import Settings, Table
-
 
 NAME = "cholesky_lu"
 FIT_STAGES = {

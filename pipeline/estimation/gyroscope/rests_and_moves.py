@@ -15,10 +15,11 @@ variance. Source: Lange, Little & Taylor, JASA 84 (1989), 881-896.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -29,32 +30,27 @@ from pipeline.core.records import (
     MATRIX_NAMES,
     Multiply,
     OutlyingMove,
+    Recording,
     SensorCalibration,
     StageDetails,
     StageResult,
     Subtract,
     TurnAxes,
+    Values,
 )
+from pipeline.core.settings import Procedure
 from pipeline.estimation.effects import accelerometer_of, frame_error
 from pipeline.estimation.engine import ScaledColumns
-from pipeline.estimation.multi_position.fit import MIN_NEW_NORM_SHARE, with_limits
+from pipeline.estimation.multi_position.fit import MIN_NEW_NORM_SHARE, FitByHand, with_limits
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
-from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, model_of
+from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, GyroscopeModel, model_of
 from pipeline.estimation.multi_position.model import State, prior_hypotheses
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of
 from pipeline.estimation.stages import FitStage, StageInput, limits_of_base
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.core.records import Recording, Values
-    from pipeline.core.settings import Procedure
-    from pipeline.estimation.multi_position.fit import FitByHand
-    from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
-
-    Found: TypeAlias = tuple[GyroscopeModel, FitByHand, list[OutlyingMove]]
+Robust: TypeAlias = tuple[GyroscopeModel, FitByHand, list[OutlyingMove]]
 
 
 OUTLIER_FALSE_ALARM, FREEDOM = 1e-3, 4.0  # p and v
@@ -68,7 +64,7 @@ CLEARLY_BELOW = 0.9  # of the limit: axes of turns that are known so well, and n
 RECORDING_ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 
-def fit_robustly(model: GyroscopeModel, fit_model: Callable[..., FitByHand], recordings: Sequence[Recording]) -> Found:
+def fit_robustly(model: GyroscopeModel, fit_model: Callable[..., FitByHand], recordings: Sequence[Recording]) -> Robust:
     """Fit rests and moves, with weights of Student's t if a move is an outlier.
 
     ``fit_model``: function that fits a model, from ``start`` and what is ``known`` of it if given (``fit``). Returns
@@ -141,7 +137,7 @@ def fit(task: StageInput) -> SensorCalibration:
     fit_model = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
     of_frame = np.radians(frame_deg) ** 2 * (1.0 - np.eye(3)).ravel()
 
-    def fit_with(held: Mapping[str, float], whole: GyroscopeModel = model) -> tuple[Found, Values]:
+    def fit_with(held: Mapping[str, float], whole: GyroscopeModel = model) -> tuple[Robust, Values]:
         part = copy(whole)
         part.known_by_limit = held
         base = part.equations(start).base

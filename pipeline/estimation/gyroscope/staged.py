@@ -21,8 +21,9 @@ these recordings the bias is from the static recording. As printed, row i is the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,6 +44,7 @@ from pipeline.core.records import (
     corrected,
     motion_at_rest,
 )
+from pipeline.core.settings import Settings
 from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative
 from pipeline.estimation.stages import FitStage, StageInput, details_on_table
 from pipeline.estimation.table_errors import Reference
@@ -50,12 +52,7 @@ from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, steady_t
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
 from pipeline.physics.signal.rests import runs
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    # step of the correction by a stage, and value and unit of each of its parameters
-    Outcome = tuple[Subtract | Multiply, dict[str, tuple[float, str]]]
-    from pipeline.core.settings import Settings
+EstimatedStep = tuple[Subtract | Multiply, dict[str, tuple[float, str]]]
 
 # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
 DIFFERENCE_STEP_DPS = 1e-5
@@ -68,7 +65,7 @@ FIT_STAGES = {
 }
 
 
-def bias(response: Response) -> Outcome:
+def bias(response: Response) -> EstimatedStep:
     """Return the bias (3.47-3.48): ``g_bi = g_r - b``, b the mean of the readings at rest.
 
     The rests are those of the recordings made for the gyroscope, by the table's log, as in the thesis. The static
@@ -78,7 +75,7 @@ def bias(response: Response) -> Outcome:
     return Subtract(response.rest), values
 
 
-def orthogonality_and_misalignment(response: Response) -> Outcome:
+def orthogonality_and_misalignment(response: Response) -> EstimatedStep:
     """Return the matrix of orthogonality and misalignment (3.49-3.51).
 
         S M = diag(I),   M = S^-1 diag(I),   g_mis = g_bi M
@@ -96,7 +93,7 @@ def orthogonality_and_misalignment(response: Response) -> Outcome:
     return Multiply(np.array(M.T, np.float64, order="C")), values
 
 
-def scale_factor(response: Response) -> Outcome:
+def scale_factor(response: Response) -> EstimatedStep:
     """Return the scale factors (3.52-3.53): ``S_i = I_i / (g_max - g_min)``, ``g_sc = g_mis S``.
 
     g_max is the reading of axis i while the table turns about it at the rate I_i, and g_min its reading at rest. The

@@ -16,8 +16,9 @@ gravity and the observed one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +38,7 @@ from pipeline.core.records import (
     cross,
     level_in_body,
 )
+from pipeline.core.settings import Procedure
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.multi_position.accelerometer import white_of
 from pipeline.estimation.multi_position.faces_and_turns import turns_of
@@ -47,12 +49,6 @@ from pipeline.estimation.rest_means import HELD_OUT, ROLE, is_multi_position, re
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.physics.compensation import Compensation
 from pipeline.physics.effects import effect
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.settings import Procedure
-
 
 DRIFT_TIME_S = 60.0  # s over which a drift is stated
 DRIFT_STARTS = 60  # starts over which a drift is averaged

@@ -28,8 +28,9 @@ of local gravity and of the time base are the same in calibration and reference.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -39,13 +40,16 @@ from pipeline.core.records import (
     MATRIX,
     Agreement,
     LimitCheck,
+    Noise,
     OverTemperature,
+    Recording,
+    SensorCalibration,
     SensorValidation,
     StepErrors,
     TemperatureBin,
     UnitRecordings,
 )
-from pipeline.core.settings import Uncertainty
+from pipeline.core.settings import SensorLimits, Settings, Uncertainty
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.accelerometer.nonlinear_least_squares import PARAMETER_NAMES
 from pipeline.estimation.rest_means import count_of_rests
@@ -68,12 +72,6 @@ from pipeline.physics.effects import bench_priors, effect_of
 from pipeline.physics.effects.base import unit_of
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.signal.rests import Rest
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.records import Noise, Recording, SensorCalibration
-    from pipeline.core.settings import SensorLimits, Settings
 
 FALSE_REFUSALS = 1e-3  # probability that a calibration as good as the raw readings is refused
 STRETCHES = 20  # a stretch of a recording of minutes is longer than the correlation time of most wander

@@ -24,11 +24,12 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, replace
 from dataclasses import fields as dataclass_fields
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
@@ -37,6 +38,7 @@ from pipeline.core.compiled_templates import CompiledTemplates
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import JSON, Check, WrongValueError, each, fields, one_of
 from pipeline.core.records import SENSORS, FittedEffect, Quantities, Reduced, SensorCalibration
+from pipeline.core.settings import Settings
 from pipeline.output.exports.sensors import (
     TEMPLATE_FUNCTIONS,
     UNIT_FACTORS,
@@ -52,11 +54,6 @@ from pipeline.physics.effects import effect_of
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.physics.formula import c_number
 from pipeline.physics.measurement import FIELDS_OF_SIGNALS, sensor_effects
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from pipeline.core.settings import Settings
 
 TEMPLATES = Path(__file__).parent / "templates"
 # of the fixed point: each gains about two digits, and a relative error of 1e-13 is the goal

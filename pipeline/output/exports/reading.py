@@ -18,12 +18,13 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jinja2 import TemplateError
@@ -42,22 +43,16 @@ from pipeline.core.records import (
     Coefficient,
     FittedEffect,
     SensorCalibration,
+    Values,
 )
 from pipeline.ingest.axis_maps import STRAIGHT, maps_of_log
-from pipeline.output.exports import ExportedUnit, export, formats, text_of
+from pipeline.output.exports import ExportedUnit, Format, export, formats, text_of
 from pipeline.output.exports.sensors import SI, TEMPLATE_FUNCTIONS, UNIT_FACTORS, SensorFigures, before_use
 from pipeline.output.exports.text_kinds import Expressions, Node, parsed
 from pipeline.physics.calibration_file import read_calibration, sensor_of
 from pipeline.physics.compensation import Compensation
 from pipeline.physics.effects import effect, effect_of
 from pipeline.physics.measurement import sensor_effects
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.records import Values
-    from pipeline.output.exports import Format
-
 
 CALIBRATION = "calibration.json"  # name of the format of ``calibrations/<unit>.json``
 # of a file to read; a calibration has some kilobytes, the parameters of a vehicle 100

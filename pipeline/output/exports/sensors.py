@@ -19,27 +19,23 @@ because its density is one-sided. Quantisation, ramps and sinusoids are not incl
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from math import comb
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
 
-from pipeline.core.records import AXES, BIAS, SENSORS
+from pipeline.core.files import JSON
+from pipeline.core.records import AXES, BIAS, SENSORS, Reduced, SensorCalibration, Values
+from pipeline.core.settings import DataSheet
 from pipeline.estimation.noise_terms import allan_variance
 from pipeline.ingest.axis_maps import STRAIGHT, maps_of_log
 from pipeline.physics.calibration_file import MIN_EXPORTED_TIME_S
 from pipeline.physics.effects import owner_of
 from pipeline.physics.effects.base import OF_THE_BIAS, REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
 from pipeline.physics.statements import sentences
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.files import JSON
-    from pipeline.core.records import Reduced, SensorCalibration, Values
-    from pipeline.core.settings import DataSheet
 
 UNIT_FACTORS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "deg/s": 1.0, "rad/s": float(np.pi / 180.0)}
 SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}

@@ -13,20 +13,17 @@ from __future__ import annotations
 import configparser
 import json
 import re
+from collections.abc import Callable, Iterator
 from itertools import takewhile
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
 from jinja2 import Environment, StrictUndefined
 
+from pipeline.core.records import Values
 from pipeline.output.exports.sensors import UNIT_FACTORS, shifted
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from pipeline.core.records import Values
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 ARRAY = re.compile(r"(\w+)\s*(?:\[\d*\]\s*)*=\s*(\{[^;]*\})\s*;")

@@ -10,13 +10,14 @@ import hashlib
 import json
 import re
 import sys
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, lru_cache, partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
@@ -24,15 +25,11 @@ from imu_logs.files import read_text
 from imu_logs.yaml_file import load_yaml
 from pipeline.core.errors import ConfigurationError, MissingInputError, PipelineError
 from pipeline.core.files import CONFIGS
+from pipeline.core.records import FittedEffect
+from pipeline.core.settings import Table, UserEffectFiles
 from pipeline.physics.effects.base import Effect
 from pipeline.physics.effects.formula_effect import FormulaEffect, fitted_anyway, read_declaration
 from pipeline.physics.effects.mounting import SETUP_EFFECTS, in_session
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-
-    from pipeline.core.records import FittedEffect
-    from pipeline.core.settings import Table, UserEffectFiles
 
 EFFECTS_FOLDER = CONFIGS / "effect"
 BUILT_IN = re.compile(r"^built_in: true", re.MULTILINE)

@@ -12,19 +12,16 @@ acts on the sensor at the sample's time stamp (``Effect.moved``).
 from __future__ import annotations
 
 import abc
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Motion, Values
 from pipeline.physics.signal.rests import RATE_AT_REST_DPS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
 
 REFERENCE_TEMPERATURE = 25.0  # degC, that of data sheets
 STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3

@@ -32,18 +32,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.records import Motion, Values
 from pipeline.physics.effects.base import Layout, every_axis, length, truth, truth_rate, turning_direction
 from pipeline.physics.effects.formula_effect import DeclaredEffect
 from pipeline.physics.formula import c_number
 from pipeline.physics.kinematics import ABOUT, NODES, UP_AT_ZERO, WEIGHTS, skew, turn_about_axis
-
-if TYPE_CHECKING:
-    from pipeline.core.records import Motion, Values
-
 
 VERTICAL_SINE = 0.5  # sine of the elevation of the turn axis, which is 0 (level axis) or 1 (vertical axis)
 SIGNS = np.array([[1.0], [-1.0]])  # of d_x and d_y in the equation above

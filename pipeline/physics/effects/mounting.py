@@ -28,24 +28,20 @@ One session, the reference, has neither of them. The leans of a table's axes con
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import replace
 from functools import cache, partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.records import MATRIX
+from pipeline.core.records import MATRIX, Motion, Values
 from pipeline.physics.effects.base import Effect, EffectParameter, Layout, Owner, truth, unit_of
 from pipeline.physics.effects.formula_effect import DeclaredEffect
 from pipeline.physics.kinematics import skew, turn_by_vector
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from pipeline.core.records import Motion, Values
 
 ROTATION_ITERATIONS = 6  # of a fixed point; rotations of 10 deg converge by a factor of 30 in each
 ROTATION_STEP_DEG = 1e-3  # of the central difference of a rotation: its error is (step^2 / 6) rad = 5e-11

@@ -23,15 +23,11 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 from math import factorial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.records import once_of_log
+from pipeline.core.records import Mask, Recording, Values, once_of_log
 from pipeline.physics.signal.rests import RATE_AT_REST_DPS, runs
-
-if TYPE_CHECKING:
-    from pipeline.core.records import Mask, Recording, Values
 
 VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; a smaller error of the rate does no harm
 STEP_MULTIPLE_TOLERANCE = 1e-3  # of a step, to which the angles of an encoder are multiples of it: printed decimals

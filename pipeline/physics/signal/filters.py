@@ -41,19 +41,16 @@ Lepski, Theory of Probability and Its Applications 35, 1991.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.records import Integers, Note, Recording, Values, noise_of_steps, once_of_log
 from pipeline.core.settings import Filter
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
 
 MAX_GAP_MEDIANS = 1.5  # medians of the interval: a lost sample makes two of one
 JITTER = 0.1  # of the interval: beyond it samples count as uneven

@@ -40,18 +40,15 @@ pieces between which it turned by less than the limit of a rest, only the longes
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.records import MEDIAN_SIZE, Mask, Recording, Values, median, noise_of_steps, once
 from pipeline.physics.signal.filters import filter_autocovariance, variance_of_mean
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    Spans = list[tuple[int, int]]
+Spans = list[tuple[int, int]]
 
 PARABOLA_DEGREE = 2  # of the parabola
 SIGNIFICANT_CREEP = 4.0  # standard deviations: of the two components, noise alone passes it in 3e-4

@@ -24,9 +24,9 @@ no mean by a tenth of the noise that all means have together (``Settling``).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,17 +34,13 @@ from pipeline.core.records import BETWEEN_ATTITUDES_S, Integers, Mask, Recording
 from pipeline.physics.signal.filters import filter_autocovariance, stretch_starts
 from pipeline.physics.signal.quiet_motion import (
     RATE_LIMIT_DPS,
+    Spans,
     before_slow_motion,
     counts_of,
     creep_of_rest,
     quiet_pieces,
     windows,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    Spans = list[tuple[int, int]]
 
 RATE_AT_REST_DPS = 0.02  # above the rate noise of a resting table
 SETTLING_S = 0.3  # fifteen time constants of the slowest filter of 20 ms, as in ``pipeline.physics.kinematics``

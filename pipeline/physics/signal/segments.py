@@ -28,31 +28,27 @@ where
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import AXES, Mask, Note, Recording, Values, rate_of_attitude
-from pipeline.core.settings import Window
+from pipeline.core.settings import HandTurns, RecordingFile, Table, Window
 from pipeline.physics.signal.rests import (
     RATE_AT_REST_DPS,
     RESTS,
     SETTLING_S,
     SHORTEST_REST_S,
     WINDOW_S,
+    Rest,
     find_rests,
     runs,
     still_samples,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.settings import HandTurns, RecordingFile, Table
-    from pipeline.physics.signal.rests import Rest
 
 FEWEST_STOPS = 4  # attitudes about one axis that determine a bias and a row of the matrix
 BESIDE_S, BESIDE_FREE_S = 30.0, 1.0  # largest length of the adjacent rest that a segment includes
