@@ -43,7 +43,8 @@ from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, us
 ROLE, HELD_OUT = "rests", "validation"
 SOAK, ATTITUDES = "soak", "attitudes"  # kinds of recordings in the sheet; times of attitudes do not count
 BY_HAND = ("", "moves")  # kinds with rests and moves by hand, of which some are held out; "": without a sheet
-OF_ALL = ("clock_shared", "kinds", "swings")  # fields of ``Rests`` that are no arrays
+OF_ALL = ("clock_shared", "kinds", "swings", "repeats")  # fields of ``Rests`` that are no arrays
+PASSED, MOST = 20, 0.5  # temperatures between the ends of a soak; the share of them that makes a second cycle
 
 
 @dataclass(frozen=True)
@@ -229,6 +230,7 @@ class Rests:
     clock_shared: bool  # whether the time between the recordings is known
     kinds: frozenset[str] = frozenset()  # of the recordings, in the sheet
     swings: bool = False  # whether the temperature rises and falls in the recordings
+    repeats: bool = True  # whether soaks, if any, pass most temperatures twice in one direction
 
     def select(self, index: Mask | slice) -> Self:
         """Return some of the rests."""
@@ -314,7 +316,21 @@ def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, 
     shared = len(np.unique(columns["recording"])) == 1 or all(recordings[index].clock_shared for index in chosen)
     used = [recordings[index] for index in chosen]
     swings = heats_and_cools(temperature_of(r) for r in used if r.temperature is not None and r.kind != ATTITUDES)
-    return Rests(**columns, clock_shared=shared, kinds=frozenset(r.kind for r in used), swings=swings)
+    repeats = passed_again(columns["temperature"][columns["soaked"]])
+    return Rests(**columns, clock_shared=shared, kinds=frozenset(r.kind for r in used), swings=swings, repeats=repeats)
+
+
+def passed_again(temperature: Values) -> bool:
+    """Return whether a soak passes ``MOST`` temperatures twice in one direction; (k,) array, degC, in order of time.
+
+    If not, heating differs from cooling by hysteresis as by a drift. True without a soak or a temperature.
+    """
+    if not len(temperature) or np.isnan(temperature).any():
+        return True
+    levels = np.linspace(temperature.min(), temperature.max(), PASSED + 2)[1:-1]
+    steps = np.diff((temperature[:, None] > levels).astype(int), axis=0)
+    again = np.maximum((steps > 0).sum(axis=0), (steps < 0).sum(axis=0)) > 1
+    return bool(again.mean() > MOST)
 
 
 @dataclass(frozen=True)

@@ -228,7 +228,7 @@ def _at_mean_temperature(model: Model) -> Model:
         return model
     shift, out = REFERENCE_TEMPERATURE - float(mean), copy(model)
     out.rests = replace(model.rests, temperature=model.rests.temperature + shift)
-    for name in ("moves", "turns"):
+    for name in ("moves", "turns", "soaks", "attitudes"):
         part = getattr(model, name, None)
         if part is not None:
             setattr(out, name, replace(part, temperature=part.temperature + shift))

@@ -19,18 +19,20 @@ a misalignment that the rests do not determine is known by the sensor file's lim
 because L_ij is the angle between two axes, the sum of their two cross-axis sensitivities, both uniform within c. With a
 sheet of recordings the same holds for bias and scale factors, uniform within their limits.
 
-Equations of a soak: the attitude is fixed while the temperature changes, so readings differ by effects alone.
+Equations of a soak: the attitude is fixed while the temperature changes. Its mean reading is a rest of the fit, with
+the mean of the effects z over its parts, so that an error of one part, as by hysteresis, does not move all. The
+readings y_k of its K parts differ by effects alone:
 
-    y_k - y_0 = z(T_k) - z(T_0)
+    y_k - c(y) = z(T_k) - c(z),   c(x) = (sqrt(K) mean(x) - x_0) / (sqrt(K) - 1),   k = 1 ... K - 1
 
-with the mean readings y_k of the parts of a soak, and that of the part nearest to 25 degC, y_0, which is also a rest of
-the fit; z are the effects at the specific force of that part. In one attitude a change of the bias along gravity is not
-distinguished from one of the scale factor; in several it is.
+with the effects at the specific force of the attitude. By c these are rows of a Householder reflection: errors of the
+parts that are equal and independent make errors of the equations that are so too, and independent of the mean's. In
+one attitude a change of the bias along gravity is not distinguished from one of the scale factor; in several it is.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,12 +49,12 @@ from pipeline.estimation.multi_position.model import (
     motion_at_rests,
     stacked,
 )
-from pipeline.estimation.rest_means import HELD_OUT, Rests, nearest_to_reference, rests_of
+from pipeline.estimation.rest_means import HELD_OUT, Rests, rests_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.core.records import Index, Mask, Noise, Recording, SensorCalibration, Values
+    from pipeline.core.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
     from pipeline.core.settings import DataSheet, Settings
     from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.model import State
@@ -69,72 +71,43 @@ PARAMETERS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Soaks:
-    """The parts of the soaks of an accelerometer, without the reference of each."""
-
-    rests: Rests  # (k,) parts
-    reference: Rests  # (s,), one a soak
-    of: Index  # (k,), the soak of each part
-
-    def equations(self, state: State, force: Values, white: Values) -> EquationBlock:
-        """Return the equations; ``force``: (s, 3), g, of the references; ``white``: (3,), noise of a sample."""
-        rests, first = self.rests, self.reference
-        variance, of_first = (r.variance(white) for r in (rests, first))
-        error = np.sqrt(variance + of_first[self.of])
-        at, there = motion_at_rests(rests, force[self.of]), motion_at_rests(first, force)
-        z, z_first = (effect_readings("accelerometer", state.terms, motion, state.K) for motion in (at, there))
-        residual = (rests.reading - first.reading[self.of] - z + z_first[self.of]) / error
-        k, s = len(rests.time), len(first.time)
-        bias, number = np.zeros((3, k, 3, k + s)), np.arange(k)
-        for c in range(3):
-            bias[c, number, c, number] = white[c] / error[:, c]
-            bias[c, number, c, k + self.of] = -white[c] / error[:, c]
-        same = (self.of[:, None] == self.of) & ~np.eye(k, dtype=bool)
-        common = np.zeros((k, 3, k, 3))
-        for c in range(3):
-            shared = of_first[self.of, c] / error[:, c]
-            common[:, c, :, c] = np.where(same, shared[:, None] / error[:, c], 0.0)
-
-        def columns(term: EffectColumns) -> Values:
-            Z, Z_first = (term.effect.columns("accelerometer", motion, state.K, term.values) for motion in (at, there))
-            return np.asarray(((Z - Z_first[self.of]) / error[:, :, None]).reshape(3 * k, -1))
-
-        times = (np.concatenate([getattr(r, name) for r in (rests, first)]) for name in ("start", "length"))
-        return EquationBlock(
-            residual.ravel(),
-            np.zeros((3 * k, BASE_COUNT)),
-            columns,
-            error.ravel(),
-            bias.reshape(3, 3 * k, k + s),
-            (*times, np.concatenate([rests.recording, first.recording])),  # type: ignore[arg-type]
-            scattered=True,
-            common=common.reshape(3 * k, 3 * k),
-        )
-
-
-def parted(rests: Rests) -> tuple[Rests, Soaks | None]:
-    """Return the rests of the fit, a soak with one of its parts, and the other parts of all soaks; None without one."""
+def parted(rests: Rests) -> tuple[Rests, Rests | None]:
+    """Return the rests of the fit, a soak as the mean of its parts, and the parts of all soaks; None without one."""
     if not rests.soaked.any():
         return rests, None
-    names = np.unique(rests.recording[rests.soaked])
-    chosen = np.array(
-        [
-            own[nearest_to_reference(rests.temperature[own])]
-            for own in (np.flatnonzero(rests.recording == n) for n in names)
-        ]
-    )
-    other = rests.soaked.copy()
-    other[chosen] = False
-    parts = rests.select(other)
-    return rests.select(~other), Soaks(parts, rests.select(chosen), np.searchsorted(names, parts.recording))
+    parts = rests.select(rests.soaked)
+    _, first, of = np.unique(rests.recording[rests.soaked], return_index=True, return_inverse=True)
+    kept, number = ~rests.soaked, np.flatnonzero(rests.soaked)[first]
+    kept[number] = True
+    own = (np.arange(len(first))[:, None] == of).astype(float)
+    mean = own / own.sum(axis=1, keepdims=True)
+    found = rests.select(kept)
+    for weights, names in (
+        (mean, ("reading", "time", "temperature", "temperature_rate")),
+        (mean**2, ("share", "own")),
+        (own, ("count", "scatter", "length")),
+    ):
+        columns = {name: getattr(found, name).copy() for name in names}
+        for name, column in columns.items():
+            column[found.soaked] = weights @ getattr(parts, name)
+        found = replace(found, **columns)
+    return found, parts
+
+
+def contrasts(parts: Rests) -> Values:
+    """Return the differences of the K parts of each soak from their c: (k - s, k) array of orthonormal rows."""
+    blocks = []
+    for size in np.unique(parts.recording, return_counts=True)[1].tolist():
+        v = np.full(size, 1.0 / np.sqrt(size)) - np.eye(size)[0]
+        blocks.append((np.eye(size) - 2.0 * np.outer(v, v) / max(float(v @ v), SMALLEST_NOISE))[1:])
+    return np.asarray(scipy.linalg.block_diag(*blocks))
 
 
 class AccelerometerModel:
     """Equations of the accelerometer's rests.
 
     ``rests``: rests of the fit. ``directions``: (12, b), change of bias and matrix by each base parameter. ``held``:
-    held-out rests. ``soaks``: further parts of soaks. ``faces``: of ``rests``, if they are stated: the full matrix is
+    held-out rests. ``soaks``: parts of soaks. ``faces``: of ``rests``, if they are stated: the full matrix is
     then free. ``known_by_limit``: parameters with a pseudo-observation, each with its u. ``wander``: whether the
     equations include the errors by a Gauss-Markov bias.
     """
@@ -153,7 +126,7 @@ class AccelerometerModel:
         faces: Faces | None = None,
         known_by_limit: Mapping[str, float] | None = None,
         wander: bool = True,
-        soaks: Soaks | None = None,
+        soaks: Rests | None = None,
     ) -> None:
         self.rests, self.gravity, self.held, self.faces = rests, gravity_g, held, faces
         self.soaks = soaks
@@ -162,7 +135,16 @@ class AccelerometerModel:
         self.directions = directions if faces is None else np.eye(BASE_COUNT)
         self.known_by_limit = {} if known_by_limit is None or faces is not None else known_by_limit
         self.rests_equations = len(rests.time)
-        self.stretches = len(rests.time) if wander else 0
+        shares, stretches = np.eye(len(rests.time)), [rests]
+        if soaks is not None:
+            self.attitudes, _ = parted(soaks)
+            shares, stretches = self._shares(rests), [rests.select(~rests.soaked), soaks]
+        self.shares = shares[:, : shares.shape[1] if wander else 0]  # (m, t), of each stretch of time in each rest
+        t = self.shares.shape[1]
+        start, length, recording = (
+            np.concatenate([getattr(r, n) for r in stretches])[:t] for n in ("start", "length", "recording")
+        )
+        self.stretches = start, length, recording
         self.after_moves = False  # whether effects see the direction of the last move (``last_moves``)
 
     def equations(self, state: State, candidates: Sequence[EffectColumns] = ()) -> Equations:
@@ -175,33 +157,31 @@ class AccelerometerModel:
         variance = rests.variance(self.white)
         error = np.sqrt(np.sum(along**2 * variance, axis=1))
         target = np.sqrt(self.gravity**2 + 2.0 * (rests.share * np.mean(self.white**2) + rests.own))
-        motion = motion_at_rests(rests, self.gravity * n)
-        if self.after_moves:
-            motion = replace(motion, direction=last_moves(state, rests, n))
+        after = last_moves(state, rests, n) if self.after_moves else None
         base = np.concatenate([-along, (n[:, :, None] * v[:, None, :]).reshape(-1, 9)], axis=1)
 
         def effect_columns(term: EffectColumns) -> Values:
-            return term.effect.columns(self.sensor, motion, state.K, term.values)
+            return self._at_rests(
+                rests,
+                self.gravity * n,
+                lambda motion: term.effect.columns(self.sensor, motion, state.K, term.values),
+                after,
+            )
 
-        places, H = np.arange(self.stretches), np.zeros((3, len(error), self.stretches))
-        H[:, places, places] = (along * self.white / error[:, None]).T[:, places]
         of_rests = EquationBlock(
             (target - length) / error,
             base / error[:, None],
             lambda term: np.einsum("nc,ncp->np", -along, effect_columns(term)) / error[:, None],
             error,
-            H,
-            (rests.start[places], rests.length[places], rests.recording[places]),
+            (along * self.white / error[:, None]).T[:, :, None] * self.shares,
+            self.stretches,
             scattered=True,
         )
         if self.faces is None:
             columns = self.directions[:, [PARAMETERS.index(name) for name in self.known_by_limit]].T
             of_limits = limit_block(self.known_by_limit, columns, state, self.gravity)
-            blocks = [of_rests]
-            if self.soaks is not None:
-                of_references = self.specific_force(state, self.soaks.reference)[0]
-                blocks.append(self.soaks.equations(state, of_references, self.white))
-            return stacked([*blocks, of_limits], self, state, candidates)
+            of_soaks = [] if self.soaks is None else [self._of_soaks(state, self.soaks)]
+            return stacked([of_rests, *of_soaks, of_limits], self, state, candidates)
         W = self.faces.weights() / self.gravity
         WM = W @ state.matrix
         wide = np.sqrt(self.faces.error**2 + np.einsum("rmc,mc->r", WM**2, variance))
@@ -215,14 +195,60 @@ class AccelerometerModel:
         )
         return stacked([of_rests, of_faces], self, state, candidates)
 
+    def _shares(self, rests: Rests) -> Values:
+        """Return the shares of rests that are no soaks, and of the parts of soaks, in each rest: (m, t) array."""
+        assert self.soaks is not None  # noqa: S101
+        own = rests.recording[:, None] == self.soaks.recording
+        own = (own & rests.soaked[:, None]) / np.maximum(own.sum(axis=1, keepdims=True), 1)
+        return np.hstack([np.eye(len(rests.time))[:, ~rests.soaked], own])
+
+    def _at_rests(
+        self, rests: Rests, force: Values, value: Callable[[Motion], Values], direction: Values | None = None
+    ) -> Values:
+        """Return values of the motion at rests with the specific force (m, 3), g; of a soak, their mean."""
+        motion = motion_at_rests(rests, force)
+        found = value(motion if direction is None else replace(motion, direction=direction))
+        for row in np.flatnonzero(rests.soaked):
+            parts = self.soaks and self.soaks.select(self.soaks.recording == rests.recording[row])
+            if parts is not None and len(parts.time):
+                found[row] = value(motion_at_rests(parts, np.tile(force[row], (len(parts.time), 1)))).mean(axis=0)
+        return found
+
+    def _of_soaks(self, state: State, soaks: Rests) -> EquationBlock:
+        """Return the equations of the parts of soaks."""
+        force, C = self.specific_force(state, self.attitudes)[0], contrasts(soaks)
+        motion = motion_at_rests(soaks, force[np.searchsorted(self.attitudes.recording, soaks.recording)])
+        every = np.sqrt(soaks.variance(self.white))
+        error = every[np.flatnonzero(np.diff(soaks.recording, prepend=-1) == 0)]
+        z = effect_readings(self.sensor, state.terms, motion, state.K)
+        k, t = len(error), len(self.stretches[0])
+        bias = np.zeros((3, k, 3, t))
+        for c in range(3 if t else 0):
+            bias[c, :, c, t - len(soaks.time) :] = C * self.white[c] / error[:, c, None]
+
+        def columns(term: EffectColumns) -> Values:
+            Z = term.effect.columns(self.sensor, motion, state.K, term.values)
+            return np.asarray((np.einsum("ij,jcp->icp", C, Z) / error[:, :, None]).reshape(3 * k, -1))
+
+        return EquationBlock(
+            (C @ (soaks.reading - z) / error).ravel(),
+            np.zeros((3 * k, BASE_COUNT)),
+            columns,
+            error.ravel(),
+            bias.reshape(3, 3 * k, t),
+            scattered=True,
+        )
+
     def specific_force(self, state: State, rests: Rests) -> tuple[Values, Values]:
         """Return the specific force of each rest, g, and v: (m, 3) arrays."""
         v, K = rests.reading - state.bias, state.K
         force = v @ state.matrix.T
         for _ in range(FORCE_ITERATIONS if state.terms else 0):
             size = np.linalg.norm(force, axis=1, keepdims=True)
-            motion = motion_at_rests(rests, self.gravity * force / size)
-            v = rests.reading - state.bias - effect_readings(self.sensor, state.terms, motion, K)
+            z = self._at_rests(
+                rests, self.gravity * force / size, lambda motion: effect_readings(self.sensor, state.terms, motion, K)
+            )
+            v = rests.reading - state.bias - z
             before, force = force, v @ state.matrix.T
             if np.abs(force - before).max() < SETTLED_FORCE_G:
                 break
@@ -231,7 +257,7 @@ class AccelerometerModel:
     @property
     def temperature(self) -> Values:
         """Temperatures of all equations, degC."""
-        parts = [self.rests, *([self.soaks.rests] if self.soaks else [])]
+        parts = [self.rests, *([] if self.soaks is None else [self.soaks])]
         return np.concatenate([part.temperature for part in parts])
 
     def samples(self) -> float:

@@ -328,7 +328,7 @@ def _no_gravity(count: int) -> GravityAtRests:
 def gravity_of(
     recordings: Sequence[Recording], rests: Rests, accelerometer: SensorCalibration, moved: Values | None = None
 ) -> GravityAtRests:
-    """Return gravity at the rests of the accelerometer; ``moved``: see ``observed_rests``."""
+    """Return gravity at the rests of the accelerometer, in a soak the mean; ``moved``: see ``observed_rests``."""
     root = root_of(accelerometer.parameters.covariance[BASE, BASE])
     moved = np.zeros(BASE_COUNT) if moved is None else moved
     accelerometer = replace(
@@ -337,7 +337,10 @@ def gravity_of(
     effects = [e for e in accelerometer.effects if not effect(e.name).moves]
 
     def force_of(reading: Values) -> Values:
-        return compensate(accelerometer, reading, motion_at_rests(rests, reading), effects)
+        found = compensate(accelerometer, reading, motion_at_rests(rests, reading), effects)
+        for own in rests.soaked & (rests.recording == np.unique(rests.recording[rests.soaked])[:, None]):
+            found[own] = found[own].mean(axis=0)  # its attitude is fixed
+        return found
 
     white = float(np.mean(rests.white**2))
     force = force_of(rests.reading)

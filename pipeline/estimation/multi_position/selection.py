@@ -56,7 +56,8 @@ if TYPE_CHECKING:
 MAX_SELECTION_ROUNDS = 3 * MAX_SELECTED_EFFECTS
 POSSIBLE = 10.0  # times its limits, beyond which an effect is no explanation
 MAX_TIMES_LIMIT = 5.0  # times its limits, which bound an amplitude that a time constant leaves undetermined
-LAG = "temperature_lag"
+DRIFT, LAG = "bias_drift", "temperature_lag"
+ONE_CYCLE = "the soak passes no temperature twice in one direction, so hysteresis looks like it: heat and cool twice"
 FEWEST_PARTS = 8  # of a soak that heats and cools
 TURNING = 0.2  # of the largest rate of the temperature: where it turns round
 COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to its optimum
@@ -127,7 +128,7 @@ class SelectionByHand:
         self.limits = limits_of(model.sensor, data_sheet)
         effects = catalogue().items()
         others = [e for n, e in effects if n not in configured and (not e.shown_by or e.shown_by in model.rests.kinds)]
-        self.candidates = [e for e in others if not refusal(e, model.sensor, model.rests)]
+        self.candidates = [e for e in others if not no_candidate(e, model.sensor, model.rests)]
         self.bounds = {n: MAX_TIMES_LIMIT * limit for n, limit in self.limits.items() if effect(n).nonlinear}
         self.base = fit_configured(model, start, configured, self.hypotheses, self.bounds, small)
         self.ceilings = self.base.equations.ceilings(self.hypotheses)
@@ -337,10 +338,9 @@ class SelectionByHand:
 
 def hysteresis_of(model: Model) -> EffectColumns | None:
     """Return what thermal hysteresis adds to soaks that heat and cool, with the sign of dT/dt; None without any."""
-    soaks = getattr(model, "soaks", None)
-    parts = [soaks.rests, soaks.reference] if soaks else [model.rests.select(model.rests.soaked)]
-    rate = np.concatenate([np.zeros(0), *(part.temperature_rate for part in parts)])
-    if not model.rests.swings or len(rate) < FEWEST_PARTS or np.isnan(rate).any():
+    rate = (getattr(model, "soaks", None) or model.rests.select(model.rests.soaked)).temperature_rate
+    cold = np.isnan(model.rests.temperature_rate).any()  # some recording holds no temperature
+    if cold or not model.rests.swings or len(rate) < FEWEST_PARTS:
         return None
     terms = {"h": {"formula": f"tanh(temperature_rate / {TURNING * float(np.abs(rate).max())!r})", "unit": "1"}}
     effect = {"name": "loop", "owner": "recording", "sensors": [model.sensor], "terms": terms, "meaning": "Hysteresis."}
@@ -366,6 +366,12 @@ def refusal(candidate: Effect, sensor: str, rests: Rests) -> str:
         (candidate.needs_clock and not rests.clock_shared, "the time between the recordings is not known"),
     ]
     return next((reason for applies, reason in checks if applies), "")
+
+
+def no_candidate(candidate: Effect, sensor: str, rests: Rests) -> str:
+    """Return why an effect cannot be selected; empty if it can."""
+    confused = candidate.name == DRIFT and not rests.repeats
+    return ONE_CYCLE if confused else refusal(candidate, sensor, rests)
 
 
 def posterior(selection: SelectionByHand, hidden: Collection[str]) -> Answers:

@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.estimation.candidates import MOUNTING, NO_SWING, ZERO
 from pipeline.estimation.gates import min_gain, passes
-from pipeline.estimation.multi_position.selection import refusal
+from pipeline.estimation.multi_position.selection import DRIFT, no_candidate
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.formula_effect import FormulaEffect
 from pipeline.physics.signal.filters import MIN_SWING_DEGC, heats_and_cools
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "level": "nothing that shows the heading"}
 UNDESCRIBED = "the table's log describes no sample at which the rate changes"
-DRIFT = "bias_drift"
 LEAST_WEIGHT = float(np.log(0.01))  # log of the likelihood of a noise hypothesis over that of the likeliest
 MIN_FURTHER_EQUATIONS = 3  # equations beyond bias and matrix, to judge an effect with one coefficient
 SUFFICIENT_RESTS = 40  # rests for the effects of the catalogue
@@ -194,7 +193,7 @@ def _steady(span: float) -> str:
 def _reason_by_hand(this: Effect, selection: by_hand.SelectionByHand) -> str:
     """Return why rests and moves cannot show an effect; empty if they can."""
     model, base = selection.model, selection.fits[0]
-    refused = refusal(this, model.sensor, model.rests)
+    refused = no_candidate(this, model.sensor, model.rests)
     if refused:
         return refused
     span = float(np.ptp(model.temperature))

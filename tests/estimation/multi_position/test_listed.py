@@ -380,6 +380,46 @@ def test_a_soak_that_heats_and_cools_shows_lag_and_hysteresis(
         assert all(abs(p["value"] - b) < 1.5 * p["expanded_uncertainty"] for p, b in pairs)
 
 
+def test_hysteresis_does_not_move_the_mean_of_a_soak(tmp_path: Path) -> None:
+    """The part nearest to 25 degC is on one side of the loop."""
+    rng, n = np.random.default_rng(3), 3600
+    warm = -30.0 * np.cos(2.0 * np.pi * np.arange(n) / n)
+    force = 1e-3 * rng.normal(size=(n, 3))
+    force[:, 2] += 1.01 + 3e-4 * warm + 5e-3 * np.tanh(np.gradient(warm) / 0.01)
+    header = "time_s,accel_x_g,accel_y_g,accel_z_g,temperature_degc"
+    table_ = np.column_stack([np.arange(n), force, 25.0 + warm])
+    np.savetxt(tmp_path / "soak.csv", table_, fmt="%.8g", delimiter=",", header=header, comments="")
+    rows = "file,kind\nsoak.csv,soak\n"
+    (tmp_path / "recordings.csv").write_text(rows)
+    part = calibrated(tmp_path, "effects.accelerometer=[bias_temperature]").accelerometer
+    assert part.matrix[2, 2] * (1.01 - part.bias[2]) == pytest.approx(1.0, abs=5e-4)  # a tenth of the loop
+    for k, up in enumerate([*np.eye(3), *-np.eye(3), *(np.eye(3) * 0.6 + np.roll(np.eye(3), 1, axis=0) * 0.8)]):
+        rest = np.column_stack([np.arange(60), up + 1e-3 * rng.normal(size=(60, 3))])
+        np.savetxt(tmp_path / f"{k}.csv", rest, fmt="%.8g", delimiter=",", header=header[:-17], comments="")
+        rows += f"{k}.csv,rest\n"
+    (tmp_path / "recordings.csv").write_text(rows)
+    assert "failed" not in calibrated(tmp_path).diagnosis["accelerometer"]  # as rests without a temperature made it
+
+
+@pytest.mark.parametrize("cycles", [1, 2])
+def test_a_drift_is_told_from_hysteresis_by_a_second_cycle(tmp_path: Path, cycles: int) -> None:
+    rng, n = np.random.default_rng(5), 5400
+    time = np.arange(float(n))
+    warm = 30.0 * np.sin(2.0 * np.pi * cycles * time / n)
+    gyro = np.outer(warm, [0.005, -0.01, 0.015]) + np.outer(time, [2e-5, -3e-5, 1e-5]) + [0.5, -1.0, 2.0]
+    table_ = np.column_stack([time, gyro + 5e-3 * np.sqrt(0.5) * rng.normal(size=(n, 3)), 25.0 + warm])
+    header = "time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,temperature_degc"
+    np.savetxt(tmp_path / "soak.csv", table_, fmt="%.8g", delimiter=",", header=header, comments="")
+    (tmp_path / "recordings.csv").write_text("file,kind\nsoak.csv,soak\n")
+    found = calibrated(tmp_path, "effects.gyroscope=auto")
+    named, diagnosis = [e["name"] for e in found.calibration["gyroscope"]["effects"]], found.diagnosis["gyroscope"]
+    assert ("bias_drift" in named) is (cycles > 1)
+    reasons = {each["effect"]: each["reason"] for each in diagnosis["not_observable"]}
+    assert ("bias_drift" in reasons) is (cycles == 1)
+    if cycles == 1:
+        assert "twice in one direction" in reasons["bias_drift"]
+
+
 def test_a_lag_below_its_gate_is_no_hysteresis(tmp_path: Path) -> None:
     rng, n, keep = np.random.default_rng(27), 5400, np.exp(-0.5)  # a lag of 2 s; here hysteresis passes the test, too
     die = 30.0 * np.sin(np.pi * np.arange(n) / n) ** 2
