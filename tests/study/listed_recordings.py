@@ -2,24 +2,32 @@
 
     python tests/study/listed_recordings.py --kind turns --units 30 --seed 1
 
-The simulation uses no code of the package. It writes ``recordings.csv`` and its files, and ``pipeline.calibrate`` reads
-them. A parameter is inside where the published value is within the published U of the truth. Parameters that the
-recordings determine and those held by the sensor file are counted apart.
+The simulation uses no code of the package. It writes ``recordings.csv`` and its files, which are calibrated as by
+``pipeline.calibrate``, without a diagnosis, of which nothing is counted. A parameter is inside where the published
+value is within the published U of the truth. Parameters that the recordings determine and those held by the sensor file
+are counted apart.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pandas as pd
 import scipy
 
-import pipeline
 from imu_research.figures import MeasuredFigure, clustered_share, share, write_figures
+from pipeline.app.one_unit import unit_without_campaign
 
 RATE_HZ = 100.0
 # As the sensor file mpu6050: white noise of a sample, bias wander, its time; limits of bias, scale factor, cross-axis.
@@ -29,6 +37,10 @@ TAU_S = 100.0
 LIMITS = {"accelerometer": (0.08, 0.03, 0.02), "gyroscope": (20.0, 0.03, 0.02)}
 BETWEEN = 0.01  # deg/s, of the gyroscope's bias between files
 COLUMNS = "time_s,accel_x_g,accel_y_g,accel_z_g,gyro_x_dps,gyro_y_dps,gyro_z_dps"
+
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 
 class Unit:
@@ -256,7 +268,7 @@ KINDS = {
 }
 
 
-def run(kind: str, seed: int, number: int) -> dict[str, list[tuple[str, float, bool]]]:
+def run(number: int, *, kind: str, seed: int) -> dict[str, list[tuple[str, float, bool]]]:
     """Calibrate a unit; returns for each sensor parameter, error over U, and whether recordings determine it."""
     with tempfile.TemporaryDirectory() as name:
         unit = Unit(Path(name), np.random.default_rng([seed, number]))
@@ -266,9 +278,12 @@ def run(kind: str, seed: int, number: int) -> dict[str, list[tuple[str, float, b
         where = "single_axis" if kind.startswith("table") else "hand"
         overrides += ["table.seat_deg=null"] if where != "hand" else []
         overrides += ["effects.gyroscope=auto"] if kind == "soak" else []
-        found = pipeline.calibrate(
-            unit.folder, sensor="mpu6050", table=where, procedure="listed", overrides=overrides
-        ).calibration
+        chosen = {"sensor": "mpu6050", "table": where, "procedure": "listed", "method": None}
+        configured = unit_without_campaign(unit.folder, chosen, overrides, ())
+        state = configured.run_to("validate")
+        state.diagnosed = SimpleNamespace(document={}, omissions=[])
+        found = configured.run_to(first="calibration", state=state).calibration
+    assert found is not None
     out: dict[str, list[tuple[str, float, bool]]] = {}
     names = [f"bias_{a}" for a in "xyz"] + [f"matrix_{i}{j}" for i in "xyz" for j in "xyz"]
     for sensor in LIMITS:
@@ -299,22 +314,27 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--kind", required=True, help=f"{', '.join(KINDS)}; several separated by commas, or all")
     parser.add_argument("--units", type=int, default=30)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--figures", type=Path, help="file for the shares with their 99 % intervals, clustered by unit")
     arguments = parser.parse_args(argv)
     kinds = [*KINDS] if arguments.kind == "all" else arguments.kind.split(",")
-    figures = [figure for kind in kinds for figure in told(kind, arguments.units, arguments.seed)]
+    with ProcessPoolExecutor(arguments.processes) as pool:
+        figures = [
+            figure
+            for kind in kinds
+            for figure in told(kind, pool.map(partial(run, kind=kind, seed=arguments.seed), range(arguments.units)))
+        ]
     if arguments.figures:
         write_figures(arguments.figures, figures)
     return 0
 
 
-def told(kind: str, units: int, seed: int) -> list[MeasuredFigure]:
+def told(kind: str, units: Iterable[dict[str, list[tuple[str, float, bool]]]]) -> list[MeasuredFigure]:
     """Print the shares of a kind by sensor and group of parameters; returns those of all parameters."""
     counts: dict[tuple[str, str, str], list[float]] = {}
     by_unit: dict[bool, list[list[bool]]] = {True: [], False: []}
     named: list[bool] = []  # whether the effects of a soak are named, and no other
-    for number in range(units):
-        found = run(kind, seed, number)
+    for found in units:
         named += [ratio == 0.0 for _, ratio, _ in found.pop("effects", [])]
         for recorded, each in by_unit.items():
             each.append([abs(ratio) <= 1.0 for rows in found.values() for _, ratio, by in rows if by is recorded])

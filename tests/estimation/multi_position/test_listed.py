@@ -242,7 +242,7 @@ def test_a_table_that_turned_the_other_way_or_logs_nothing_is_refused(tmp_path: 
 
 
 def test_few_rests_near_a_plane_do_not_lead_away_from_the_sensor_files_limits() -> None:
-    ratios = [ratio for name, ratio, _ in run("turns", 40, 3)["accelerometer"]]
+    ratios = [ratio for name, ratio, _ in run(3, kind="turns", seed=40)["accelerometer"]]
     assert np.abs(ratios).max() < 1.5  # they were up to 71
 
 
