@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 NOISE = Noise(np.zeros(3), np.zeros(3), 100.0, "static")
 STEPS = StepErrors("raw"), StepErrors("calibrated")
-TESTED = SensorValidation("", held_out=True, reason=None, samples=9, noise=NOISE, steps=STEPS)
+TESTED = SensorValidation(unit="", held_out=True, reason=None, samples=9, noise=NOISE, steps=STEPS)
 
 
 def validation_document(unit: str, parts: Mapping[str, SensorValidation | None]) -> dict[str, Any]:

@@ -41,14 +41,19 @@ Date = Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")] | None
 REQUIRED_FIGURES = ("noise_density", "bias_wander", "wander_time_s", "bias", "scale_factor", "cross_axis", "effects")
 
 
+class BySensor(Generic[SettingOfSensor]):
+    """Settings with one of each sensor."""
+
+    def of(self, name: str) -> SettingOfSensor:
+        """Return the setting of the accelerometer or the gyroscope."""
+        found: SettingOfSensor = getattr(self, name)
+        return found
+
+
 class Section(BaseModel):
     """A part of the configuration: strict types, no unknown keys."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-    def of(self, name: str) -> Any:  # noqa: ANN401  (``OfSensors`` and ``Sensor`` state the type)
-        """Return the setting of a name, such as that of a sensor."""
-        return getattr(self, name)
 
     def replaced(self, **values: object) -> Self:
         """Return a copy with other values, which are not checked."""
@@ -113,7 +118,7 @@ class DataSheet(Section):
         return found
 
 
-class Sensor(Section):
+class Sensor(Section, BySensor[DataSheet]):
     """A sensor model."""
 
     name: str
@@ -121,11 +126,6 @@ class Sensor(Section):
     temperature_accuracy_degc: NonNegative | None = None
     accelerometer: DataSheet
     gyroscope: DataSheet
-
-    def of(self, name: str) -> DataSheet:
-        """Return the figures of the accelerometer or the gyroscope."""
-        found: DataSheet = getattr(self, name)
-        return found
 
 
 class Table(Section):
@@ -233,19 +233,14 @@ class Procedure(Section):
     turns: HandTurns | None = None
 
 
-class Stages(Section):
+class Stages(Section, BySensor[list[str] | None]):
     """The stages of a method, per sensor."""
 
     accelerometer: list[str] | None = None
     gyroscope: list[str] | None = None
 
-    def of(self, name: str) -> list[str] | None:
-        """Return the stages of a sensor."""
-        found: list[str] | None = getattr(self, name)
-        return found
 
-
-class Method(Section):
+class Method(Section, BySensor[str | None]):
     """The method for each sensor."""
 
     name: str
@@ -257,11 +252,6 @@ class Method(Section):
     stages: Stages
     given: dict[str, Any] | None = None  # of ``method=given``: the calibration that was read (``with_given``)
     known: dict[str, list[dict[str, Any]]] | None = None  # effects that stages of a sensor know, name and parameters
-
-    def of(self, name: str) -> str | None:
-        """Return the method of a sensor; None if it is not calibrated."""
-        found: str | None = getattr(self, name)
-        return found
 
 
 class Filter(Section):
@@ -276,16 +266,11 @@ class Filter(Section):
     zero_phase: bool
 
 
-class OfSensors(Section, Generic[SettingOfSensor]):
+class OfSensors(Section, BySensor[SettingOfSensor], Generic[SettingOfSensor]):
     """A setting of each sensor."""
 
     accelerometer: SettingOfSensor
     gyroscope: SettingOfSensor
-
-    def of(self, name: str) -> SettingOfSensor:
-        """Return the setting of the accelerometer or the gyroscope."""
-        found: SettingOfSensor = getattr(self, name)
-        return found
 
 
 class Effects(OfSensors[list[str] | Literal["auto"]]):

@@ -225,31 +225,7 @@ def explain(
             "errors": {s: error_of(validation.get(s)) for s in SENSORS},
             "verdicts": {s: (document.get(s) or {}).get("verdict") for s in SENSORS},
             "commands": {s: commands_of(document.get(s) or {}, s, name, settings, results) for s in SENSORS},
-            "notes": [
-                *(line for s in SENSORS for line in sentences(s, calibration.get(s))),
-                *(
-                    f"{s.capitalize()}, outside the data sheet's limits: {names}."
-                    for s in SENSORS
-                    if (names := beyond_words(calibration.get(s)))
-                ),
-                *(
-                    f"U of the {s} does not include {source}: {reason}."
-                    for s in SENSORS
-                    for source, reason in beyond_uncertainty(calibration.get(s))
-                ),
-                *(f"{s.capitalize()}: {of_frame}." for s in SENSORS if (of_frame := frame_words(calibration.get(s)))),
-                *(
-                    f"{s.capitalize()}: {reason}."
-                    for s in SENSORS
-                    if (reason := (calibration.get(s) or {}).get("not_determined"))
-                ),
-                *(
-                    f"{s.capitalize()}: {NOT_CONVERGED}."
-                    for s in SENSORS
-                    if not (calibration.get(s) or {}).get("converged", True)
-                ),
-                *(f"Left out: {line}." for line in left_out(calibration.get("inputs"))),
-            ],
+            "notes": [*_notes(calibration), *(f"Left out: {line}." for line in left_out(calibration.get("inputs")))],
             "board": explain_board(calibration),
             "moves": moves_over_noise(validation),
             "by_hand": (validation.get("gravity_direction") or {}).get("reason", NO_HAND) != NO_HAND,
@@ -260,6 +236,25 @@ def explain(
         units=[*units, *({"name": unit, "failure": failure} for unit, failure in failures.items())],
     )
     return "\n".join([*_wrapped(text.splitlines(), width), ""])
+
+
+def _notes(calibration: JSON) -> list[str]:
+    """Return what a calibration states of its sensors: each kind of remark of the one, then of the other."""
+    parts = {s: calibration.get(s) or {} for s in SENSORS}
+    notes = [line for s, part in parts.items() for line in sentences(s, part)]
+    beyond = {s: beyond_words(part) for s, part in parts.items()}
+    notes += [f"{s.capitalize()}, outside the data sheet's limits: {names}." for s, names in beyond.items() if names]
+    notes += [
+        f"U of the {s} does not include {source}: {reason}."
+        for s, part in parts.items()
+        for source, reason in beyond_uncertainty(part)
+    ]
+    lacks: list[dict[str, str | None]] = [
+        {s: frame_words(part) for s, part in parts.items()},
+        {s: part.get("not_determined") for s, part in parts.items()},
+        {s: "" if part.get("converged", True) else NOT_CONVERGED for s, part in parts.items()},
+    ]
+    return notes + [f"{s.capitalize()}: {words}." for of_kind in lacks for s, words in of_kind.items() if words]
 
 
 def _urgency(part: Mapping[str, Any] | None) -> int:

@@ -214,16 +214,6 @@ def _counts_per_dps(moves: Sequence[MoveByHand], otherwise: str, *, timed: bool)
     return Guess(entry, f"counts, {measured:.3g} a deg/s, {seen}{taken}")
 
 
-def other_range(guess: Guess, sensor: Sensor | None) -> list[str]:
-    """Return a remark if the accelerometer's counts differ from those of the stated sensor."""
-    seen = guess.entry.get("counts_per_unit")
-    if sensor is None or not seen or abs(seen / sensor.accelerometer.counts_per_unit - 1) < LOW_COST_ERROR:
-        return []
-    name, stated = sensor.name, sensor.accelerometer.counts_per_unit
-    where = "sensor.accelerometer.range, and sensor.gyroscope.range"
-    return [f"sensor={name} states {stated:g} counts a g: set {where}, as the logger does"]
-
-
 def counts_of_sensor(guess: Guess, name: str, sensor: Sensor | None) -> Guess:
     """Return a guess of counts that refers to the configuration of the sensor, if one is stated."""
     figure = OF_SENSOR.format(name)
@@ -235,31 +225,6 @@ def counts_of_sensor(guess: Guess, name: str, sensor: Sensor | None) -> Guess:
         f"sensor.{name}.range must be the range that the logger sets"
     )
     return Guess({**guess.entry, "counts_per_unit": figure}, text)
-
-
-def find_encoder(
-    parts: Sequence[Columns], force: Values | None, rate_dps: Values | None, time_s: Values | None
-) -> None:
-    """Find the counts per turn of the named encoder, else a column that counts the turns of the readings."""
-    for columns in parts:
-        numbers, names = columns.log.numbers, columns.log.names
-        named = columns.others.get("table_angle")
-        if columns.turn or (named is not None and stated_unit(names[named], "table_angle")[0]):
-            continue
-        if named is not None and (turn := counts_a_turn(numbers[named])):
-            columns.turn = turn, f"starts again after {turn} counts"
-            continue
-        free = [i for i in columns.free() if not _is_estimate(words_of(names[i]))]
-        free.sort(key=lambda i: not whole(numbers[i]))  # counts are of an encoder, an angle may be an estimate
-        turns = ((i, _encoder_turn(numbers[i], force, rate_dps, time_s)) for i in (free if named is None else [named]))
-        index, columns.turn = next(((i, turn) for i, turn in turns if turn), (named, None))
-        if columns.turn and index is not None:
-            columns.others["table_angle"] = index
-            what = f"{names[index]} is taken as the table's encoder by its numbers" if named is None else names[index]
-            remark = "check counts and sign, and add offset, the count at angle 0"
-            if unit_of_turn(columns.turn[0]):
-                remark = "check sign and unit, and leave it out if it is an estimate from the same readings"
-            columns.remarks.append(f"{what}: {remark}")
 
 
 def _is_estimate(words: Sequence[str]) -> bool:
@@ -388,11 +353,37 @@ class ByMotion(Evidence):
         self, parts: Sequence[Columns], force: Values | None, rate_dps: Values | None, time_s: Values | None
     ) -> None:
         """Find the counts per turn of the named encoder, else a column that counts the turns of the readings."""
-        find_encoder(parts, force, rate_dps, time_s)
+        for columns in parts:
+            numbers, names = columns.log.numbers, columns.log.names
+            named = columns.others.get("table_angle")
+            if columns.turn or (named is not None and stated_unit(names[named], "table_angle")[0]):
+                continue
+            if named is not None and (turn := counts_a_turn(numbers[named])):
+                columns.turn = turn, f"starts again after {turn} counts"
+                continue
+            free = [i for i in columns.free() if not _is_estimate(words_of(names[i]))]
+            free.sort(key=lambda i: not whole(numbers[i]))  # counts are of an encoder, an angle may be an estimate
+            turns = (
+                (i, _encoder_turn(numbers[i], force, rate_dps, time_s)) for i in (free if named is None else [named])
+            )
+            index, columns.turn = next(((i, turn) for i, turn in turns if turn), (named, None))
+            if columns.turn and index is not None:
+                columns.others["table_angle"] = index
+                what = (
+                    f"{names[index]} is taken as the table's encoder by its numbers" if named is None else names[index]
+                )
+                remark = "check counts and sign, and add offset, the count at angle 0"
+                if unit_of_turn(columns.turn[0]):
+                    remark = "check sign and unit, and leave it out if it is an estimate from the same readings"
+                columns.remarks.append(f"{what}: {remark}")
 
     def remarks(self, force: Guess) -> list[str]:
         """Return a remark if the accelerometer's counts differ from those of the stated sensor."""
-        return other_range(force, self.model)
+        seen, stated = force.entry.get("counts_per_unit"), self.model and self.model.accelerometer.counts_per_unit
+        if not seen or not stated or abs(seen / stated - 1) < LOW_COST_ERROR:
+            return []
+        where = "sensor.accelerometer.range, and sensor.gyroscope.range"
+        return [f"sensor={self.sensor} states {stated:g} counts a g: set {where}, as the logger does"]
 
 
 def propose(logs: Sequence[UnknownLog], model: Sensor | None = None) -> list[Proposal]:

@@ -8,18 +8,16 @@ row by row; then ``<effect>.<parameter>``, or the parameters of a stage. The bas
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from imu_logs.units import AXES, SENSOR_UNITS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from numpy.typing import ArrayLike
-
     from imu_logs.log import Index, Mask, Values
 
 
@@ -41,6 +39,22 @@ PART_NAMES = {
     "wander_and_scatter": "bias wander and scatter of the rests",
 }
 MONTE_CARLO = "monte_carlo"  # key of the run in a published budget
+
+
+def as_json(value: Any) -> Any:  # noqa: ANN401  (a record, or a value in one)
+    """Return the JSON value of a record: its fields by name, arrays and tuples as lists."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if is_dataclass(value):
+        value = vars(value)
+    if isinstance(value, Mapping):
+        return {key: as_json(each) for key, each in value.items()}
+    return [as_json(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def with_arrays(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a document with arrays in place of lists."""
+    return {key: np.array(value) if isinstance(value, list) else value for key, value in entries.items()}
 
 
 def base_units(sensor: str) -> tuple[str, ...]:
@@ -151,7 +165,7 @@ class NoiseParts:
 
     def to_json(self) -> dict[str, list[float]]:
         """Return the entry of the document."""
-        return {PART_NAMES[name]: values.tolist() for name, values in vars(self).items() if values is not None}
+        return {PART_NAMES[name]: values for name, values in as_json(self).items() if values is not None}
 
     @classmethod
     def from_json(cls, data: Mapping[str, list[float]]) -> Self:
@@ -291,9 +305,7 @@ class MonteCarlo:
 
     def to_json(self) -> dict[str, Any]:
         """Return the published entry."""
-        values = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
-        head = {"trials": values.pop("trials"), "reason": None}
-        return head | values | {"all_validated": bool(self.validated.all())}
+        return {"trials": self.trials, "reason": None, **as_json(self), "all_validated": bool(self.validated.all())}
 
 
 @dataclass(frozen=True)
@@ -312,11 +324,7 @@ def _run_from_json(data: Mapping[str, Any] | None) -> MonteCarlo | NoMonteCarlo 
         return None
     if not data["trials"]:
         return NoMonteCarlo(data["reason"])
-    names = (each.name for each in fields(MonteCarlo))
-    values: dict[str, Any] = {
-        name: np.array(data[name]) if isinstance(data[name], list) else data[name] for name in names
-    }
-    return MonteCarlo(**values)
+    return MonteCarlo(**with_arrays({each.name: data[each.name] for each in fields(MonteCarlo)}))
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ from pipeline.core.records.budget import (
     BudgetLine,
     Estimate,
     Parameters,
+    as_json,
     base_units,
     base_values,
     finite,
@@ -66,10 +67,6 @@ class Subtract:
         """Apply the step to (n, 3) readings."""
         return readings - self.offset
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the step as published."""
-        return {"subtract": self.offset.tolist()}
-
 
 @dataclass(frozen=True)
 class Multiply:
@@ -80,10 +77,6 @@ class Multiply:
     def apply(self, readings: Values) -> Values:
         """Apply the step to (n, 3) readings."""
         return readings @ self.matrix.T
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the step as published."""
-        return {"matrix": self.matrix.tolist()}
 
 
 @dataclass(frozen=True)
@@ -98,10 +91,6 @@ class TwoSided:
     def apply(self, readings: Values) -> Values:
         """Apply the step to (n, 3) readings."""
         return np.asarray(readings * np.where(readings > self.switch_at, self.positive, self.negative))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the step as published."""
-        return {"two_sided": {name: value.tolist() for name, value in vars(self).items()}}
 
 
 CorrectionStep: TypeAlias = Subtract | Multiply | TwoSided
@@ -125,7 +114,16 @@ def _step(entry: Mapping[str, Any]) -> CorrectionStep:
 
 def published(steps: Sequence[CorrectionStep]) -> dict[str, Any]:
     """Return the published correction."""
-    return {"steps": [step.to_json() for step in steps]}
+    return {"steps": [_entry(step) for step in steps]}
+
+
+def _entry(step: CorrectionStep) -> dict[str, Any]:
+    match step:
+        case Subtract(offset):
+            return {"subtract": offset.tolist()}
+        case Multiply(matrix):
+            return {"matrix": matrix.tolist()}
+    return {"two_sided": as_json(step)}
 
 
 def corrected(steps: Sequence[CorrectionStep], readings: Values) -> Values:
@@ -241,7 +239,7 @@ class StageDetails:
     def to_json(self) -> dict[str, Any]:
         """Return the entries of the document."""
         without_moves = ("direction_error_rms_deg", "scatter_of_moves") if self.moves is not None else ()
-        stated = {k: _plain(v) for k, v in vars(self).items() if v is not None or k in without_moves}
+        stated = {k: v for k, v in as_json(self).items() if v is not None or k in without_moves}
         return stated if self.condition is None or np.isfinite(self.condition) else {**stated, "condition": None}
 
     @classmethod
@@ -264,15 +262,6 @@ ENTRIES = {
 }  # fmt: skip
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401  (a JSON value)
-    """Return a value of ``StageDetails`` as JSON."""
-    if isinstance(value, RestUse | OutlyingMove | TurnAngle | TurnAxes):
-        return dict(vars(value))
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(each) for each in value]
-    return dict(value) if isinstance(value, Mapping) else value
-
-
 @dataclass(frozen=True)
 class StageResult:
     """One stage of a fit."""
@@ -287,9 +276,8 @@ class StageResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of the document."""
-        parameters = {name: dict(vars(estimate)) for name, estimate in self.parameters.items()}
         correction = None if self.correction is None else published(self.correction)
-        return {**vars(self), "parameters": parameters, "correction": correction, "details": self.details.to_json()}
+        return {**as_json(self), "correction": correction, "details": self.details.to_json()}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
@@ -332,9 +320,7 @@ class FittedEffect:
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of the document."""
-        parameters = {name: dict(vars(p)) for name, p in self.parameters.items()}
-        definition = {"definition": self.definition} if self.definition else {}
-        return {"name": self.name, "parameters": parameters, **definition}
+        return {key: value for key, value in as_json(self).items() if key != "definition" or value}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
@@ -435,7 +421,7 @@ class SensorCalibration:
             "converged": self.converged,
             "convergence": self.convergence and self.convergence.to_json(),
             "uncertainty_budget": self.budget and self.budget.to_json(parameters),
-            "at_limits": {name: change.tolist() for name, change in self.at_limits.items()},
+            "at_limits": as_json(self.at_limits),
         }
 
     @classmethod

@@ -5,23 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-import numpy as np
-
 from imu_logs.units import SENSORS
+from pipeline.core.records.budget import Estimate, as_json, with_arrays
 from pipeline.core.records.calibration import SCHEMA_VERSION
 from pipeline.core.records.recording import Noise
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.core.records.budget import Estimate
     from pipeline.core.verdicts import Verdict
 
 
 FEWEST_MOVES = 6  # held-out moves whose mean error counts; of fewer, the error weighted by its covariance
-KEYS_AS_THEY_ARE = (
-    "unit", "held_out", "reason", "samples", "noise_floor", "vector_noise_floor", "reference_rms", "worse_than_raw",
-)  # fmt: skip
+NOISE_AS_PUBLISHED = {  # of a published validation: field of ``Noise``
+    "white": "white", "wander": "wander", "correlation_time_s": "correlation_time",
+    "source": "source", "wander_source": "wander_source", "correlation_time_source": "time_source",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class Reduced:
     rms_error: float | None  # held-out, of the magnitude
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SensorValidation:
     """A sensor's part of ``validations/<unit>.json``."""
 
@@ -97,17 +96,17 @@ class SensorValidation:
     reason: str | None  # why no samples are held out
     samples: int
     noise: Noise
-    steps: tuple[StepErrors, ...]
     noise_floor: float | None = None
     vector_noise_floor: float | None = None
     reference_rms: float | None = None  # of the reference's magnitude
+    steps: tuple[StepErrors, ...]
     notes: tuple[str, ...] = ()
     expected_rms_error: tuple[float, float] | None = None  # None where an effect is left out
     worse_than_raw: str | None = None  # why the calibration must not be used
     agreement: Agreement | None = None
     over_temperature: OverTemperature | None = None  # only where the temperature was swept
-    limits: tuple[LimitCheck, ...] = ()
     reduced: tuple[Reduced, ...] = ()  # for formats that hold less
+    limits: tuple[LimitCheck, ...] = ()
 
     @property
     def passes(self) -> bool | None:
@@ -116,58 +115,31 @@ class SensorValidation:
 
     def to_json(self) -> dict[str, Any]:
         """Return the part of the document."""
-        over = self.over_temperature
-        bins = over and {"samples_of": over.samples_of, "bins": [dict(vars(each)) for each in over.bins]}
-        return {
-            "unit": self.unit,
-            "held_out": self.held_out,
-            "reason": self.reason,
-            "samples": self.samples,
-            "noise": {
-                "white": self.noise.white.tolist(),
-                "wander": self.noise.wander.tolist(),
-                "correlation_time_s": self.noise.correlation_time,
-                "source": self.noise.source,
-                "wander_source": self.noise.wander_source,
-                "correlation_time_source": self.noise.time_source,
-            },
-            "noise_floor": self.noise_floor,
-            "vector_noise_floor": self.vector_noise_floor,
-            "reference_rms": self.reference_rms,
-            "steps": [dict(vars(step)) for step in self.steps],
-            "notes": list(self.notes),
-            "expected_rms_error": self.expected_rms_error and list(self.expected_rms_error),
-            "worse_than_raw": self.worse_than_raw,
-            "agreement": self.agreement and dict(vars(self.agreement)),
-            **({"over_temperature": bins} if bins else {}),
-            **({"reduced": [dict(vars(each)) for each in self.reduced]} if self.reduced else {}),
-            "limits": [{"name": c.name, "limit": c.limit, "value": c.value, "pass": c.passes} for c in self.limits],
-            "pass": self.passes,
-        }
+        document: dict[str, Any] = as_json(self)
+        document["noise"] = {key: as_json(getattr(self.noise, name)) for key, name in NOISE_AS_PUBLISHED.items()}
+        document["limits"] = [
+            {"name": c.name, "limit": c.limit, "value": c.value, "pass": c.passes} for c in self.limits
+        ]
+        optional = {"over_temperature", "reduced"}
+        return {key: value for key, value in document.items() if value or key not in optional} | {"pass": self.passes}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
         """Return the object from the value of ``to_json``."""
         noise, agreement, over = data["noise"], data["agreement"], data.get("over_temperature")
-        return cls(
-            noise=Noise(
-                np.array(noise["white"], float),
-                np.array(noise["wander"], float),
-                noise["correlation_time_s"],
-                noise["source"],
-                noise["wander_source"],
-                noise["correlation_time_source"],
-            ),
-            steps=tuple(StepErrors(**step) for step in data["steps"]),
-            notes=tuple(data["notes"]),
-            expected_rms_error=data["expected_rms_error"] and tuple(data["expected_rms_error"]),
-            agreement=agreement and Agreement(**agreement),
-            over_temperature=over
-            and OverTemperature(over["samples_of"], tuple(TemperatureBin(**each) for each in over["bins"])),
-            reduced=tuple(Reduced(**each) for each in data.get("reduced", ())),
-            limits=tuple(LimitCheck(c["name"], c["limit"], c["value"], c["pass"]) for c in data["limits"]),
-            **{key: data[key] for key in KEYS_AS_THEY_ARE},
-        )
+        arrays = with_arrays(noise)
+        bins = tuple(TemperatureBin(**each) for each in over["bins"]) if over else ()
+        nested: dict[str, Any] = {
+            "noise": Noise(**{name: arrays[key] for key, name in NOISE_AS_PUBLISHED.items()}),
+            "steps": tuple(StepErrors(**step) for step in data["steps"]),
+            "notes": tuple(data["notes"]),
+            "expected_rms_error": data["expected_rms_error"] and tuple(data["expected_rms_error"]),
+            "agreement": agreement and Agreement(**agreement),
+            "over_temperature": over and OverTemperature(over["samples_of"], bins),
+            "reduced": tuple(Reduced(**each) for each in data.get("reduced", ())),
+            "limits": tuple(LimitCheck(c["name"], c["limit"], c["value"], c["pass"]) for c in data["limits"]),
+        }
+        return cls(**nested, **{name: data[name] for name in cls.__dataclass_fields__ if name not in nested})
 
 
 class MovesError(NamedTuple):
@@ -242,8 +214,7 @@ class Candidate:
     def to_json(self) -> dict[str, Any]:
         """Return the entry of the ranking."""
         alike = [{"effect": name, "share": share} for name, share in self.look_alikes.items()]
-        estimates = {name: vars(estimate) for name, estimate in self.parameters.items()}
-        document = {**vars(self), "parameters": estimates, "look_alikes": alike}
+        document = {**as_json(self), "look_alikes": alike}
         return {key: value for key, value in document.items() if key != "meaning" or value is not None}
 
 
@@ -253,10 +224,6 @@ class Answer:
 
     effects: Sequence[str]
     probability: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the entry of the answer set."""
-        return {"effects": list(self.effects), "probability": self.probability}
 
 
 @dataclass(frozen=True)
@@ -327,11 +294,7 @@ class TableEvidence:
 
     def to_json(self) -> dict[str, Any]:
         """Return the entries of the document."""
-        return {
-            "held_out": self.held_out and vars(self.held_out),
-            "formulas": [vars(each) for each in self.formulas],
-            **({"not_suggested": self.not_suggested} if self.not_suggested else {}),
-        }
+        return {key: value for key, value in as_json(self).items() if key != "not_suggested" or value}
 
 
 @dataclass(frozen=True)
@@ -406,7 +369,7 @@ class SensorDiagnosis:
             "selected": list(self.selected),
             "ranking": [entry.to_json() for entry in self.ranking],
             "probability": dict(self.probability),
-            "answer_set": [answer.to_json() for answer in self.answer_set],
+            "answer_set": as_json(self.answer_set),
             "upper_limit": {
                 name: {parameter: {"value": value, "unit": unit} for parameter, (value, unit) in limits.items()}
                 for name, limits in self.upper_limit.items()
@@ -420,7 +383,7 @@ class SensorDiagnosis:
             "override": self.override,
             "configured": list(self.configured),
             "wander": self.wander and self.wander.to_json(),
-            "method_errors": [vars(error) for error in self.method_errors],
+            "method_errors": as_json(self.method_errors),
             **(self.on_table.to_json() if self.on_table else {}),
             **self.details,
             **({"given": True} if self.given else {}),

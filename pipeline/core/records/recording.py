@@ -24,6 +24,8 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
+from pipeline.core.records.budget import as_json, with_arrays
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable
 
@@ -251,17 +253,13 @@ class Noise:
 
     def to_json(self) -> dict[str, Any]:
         """Return the noise as JSON values."""
-        likelihood = self.likelihood and {k: v.tolist() for k, v in vars(self.likelihood).items()}
-        numbers = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
-        return numbers | {"likelihood": likelihood}
+        return dict(as_json(self))
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Self:
         """Return the object from the value of ``to_json``."""
-        values: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in data.items()}
-        if data["likelihood"] is not None:
-            values["likelihood"] = WanderLikelihood(**{k: np.array(v) for k, v in data["likelihood"].items()})
-        return cls(**values)
+        likelihood = data["likelihood"] and WanderLikelihood(**with_arrays(data["likelihood"]))
+        return cls(**with_arrays(data) | {"likelihood": likelihood})
 
 
 @dataclass

@@ -106,7 +106,12 @@ def validate(
             reason += "; judged on the samples of the fit"
     count = int(sum(s.known.sum() for s in samples))
     part = SensorValidation(
-        unit_of(sensor), reason is None, reason, count, noise, (StepErrors("raw"), StepErrors("calibrated"))
+        unit=unit_of(sensor),
+        held_out=reason is None,
+        reason=reason,
+        samples=count,
+        noise=noise,
+        steps=(StepErrors("raw"), StepErrors("calibrated")),
     )
     if count:
         steps, notes = error_breakdown(calibration, samples)

@@ -37,7 +37,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from pipeline.core.compiled_templates import CompiledTemplates
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import JSON, Check, WrongValueError, each, fields, one_of
-from pipeline.core.records import SENSORS, FittedEffect, Quantities, Reduced, SensorCalibration
+from pipeline.core.records import SENSORS, FittedEffect, Quantities, Reduced, SensorCalibration, as_json
 from pipeline.core.settings import Settings
 from pipeline.output.exports.sensors import (
     TEMPLATE_FUNCTIONS,
@@ -47,7 +47,6 @@ from pipeline.output.exports.sensors import (
     before_use,
     noise,
     noise_figures,
-    plain,
 )
 from pipeline.physics.compensation import OF_THE_PAST, RATE_SMOOTHING_S, SMOOTHING_S, Steps, circular
 from pipeline.physics.effects import effect_of
@@ -272,13 +271,13 @@ def _comment(lines: list[str], mark: str = "# ", end: str = "\n", *, escape: tup
 
 
 def _json(content: Any, indent: int = 2) -> str:  # noqa: ANN401
-    return json.dumps(plain(content), indent=indent, allow_nan=False)
+    return json.dumps(as_json(content), indent=indent, allow_nan=False)
 
 
 def _yaml(content: Any) -> str:  # noqa: ANN401
     """Return YAML with keys in their order and short lists on one line, by the faster libyaml if it is available."""
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-    text: str = yaml.dump(plain(content), Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
+    text: str = yaml.dump(as_json(content), Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
     return text
 
 

@@ -367,15 +367,6 @@ def temperatures(document: Mapping[str, Any]) -> list[float]:
     return known.get("soaked_degc") or known.get("temperature_degc") or TEMPERATURES
 
 
-def plain(content: Any) -> Any:  # noqa: ANN401
-    """Return content with lists instead of arrays."""
-    if isinstance(content, dict):
-        return {key: plain(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [plain(value) for value in content]
-    return content.tolist() if isinstance(content, (np.ndarray, np.generic)) else content
-
-
 TEMPLATE_FUNCTIONS: dict[str, Any] = {
     "accelerometer_frame": accelerometer_frame,
     "identity": np.eye(3),
