@@ -32,9 +32,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.core import VERSION
 from pipeline.core.errors import PipelineError
 from pipeline.core.other_names import know_former_names
-from pipeline.core.version import VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

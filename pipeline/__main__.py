@@ -51,7 +51,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run a command or stage and return its exit code; report a user error in one line, with exit code 2."""
     command, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if command in ("-h", "--help", "--version"):
-        from pipeline.core.version import VERSION  # noqa: PLC0415  (nothing else is needed)
+        from pipeline.core import VERSION  # noqa: PLC0415  (nothing else is needed)
 
         print(f"imu-calibration {VERSION}" if command == "--version" else _help(stages="--all" in rest))
         return 0

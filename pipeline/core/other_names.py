@@ -42,7 +42,7 @@ FORMER = {  # name of version 0.1: name now; of a package, with its modules
     "pipeline.pack": "pipeline.core.pack",
     "pipeline.settings": "pipeline.core.settings",
     "pipeline.verdicts": "pipeline.core.verdicts",
-    "pipeline.version": "pipeline.core.version",
+    "pipeline.version": "pipeline.core",
     "pipeline.study": "imu_research.study",
     "pipeline.thesis": "imu_research.thesis",
 }

@@ -40,7 +40,7 @@ from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import AXES, SENSORS, Recording, continuous
 from pipeline.core.settings import ProgramRest, Repeated
 from pipeline.ingest.arrow import write_recording
-from pipeline.ingest.recordings_sheet import COLUMNS, SHEET
+from pipeline.ingest.files import COLUMNS, SHEET
 from pipeline.physics.kinematics import earth_of
 from pipeline.simulation.description import (
     BY_FILE,

@@ -27,7 +27,7 @@ TAKE_JSON = {
         "app/commands/explain.py", "app/commands/noise.py", "evaluation/diagnosis/words.py", "output/exports/",
         "app/field_logs/stream.py", "output/history.py", "ingest/arrow.py", "ingest/axis_maps.py", "app/one_unit.py",
         "ingest/files.py",
-        "physics/calibration_file.py", "physics/compensation.py", "physics/statements.py",
+        "physics/compensation.py", "physics/statements.py",
         "output/outcome.py", "app/planning/plan.py", "core/records/",
         "output/pages/", "app/results_folder.py", "app/steps/", "core/verdicts.py",
     ),

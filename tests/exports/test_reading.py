@@ -19,7 +19,7 @@ from pipeline.core.records import SENSORS, SensorCalibration
 from pipeline.output import exports
 from pipeline.output.exports import formats
 from pipeline.output.exports.reading import SAMPLE, explain_calibration, read_any
-from pipeline.physics.calibration_file import read_calibration
+from pipeline.physics.compensation import read_calibration
 
 G0, RADIAN = 9.80665, np.pi / 180.0
 EFFECTS = {"accelerometer": (WARMER, SCALED), "gyroscope": (SENSITIVE, WARM)}

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from pipeline.app.steps.calibration import calibrated_range, judged
 from pipeline.core.records import Coefficient, FittedEffect, Recording, SensorCalibration
 from pipeline.ingest.quality_flags import CLIPPED
-from pipeline.physics.calibration_file import sample_covariance
+from pipeline.physics.compensation import sample_covariance
 from pipeline.physics.statements import implausible, sentences
 from pipeline.simulation.description import shipped_settings
 

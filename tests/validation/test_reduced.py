@@ -14,7 +14,7 @@ import pipeline
 from pipeline.app.commands.add import changed_files
 from pipeline.app.commands.convert import main as convert
 from pipeline.app.one_unit import unit_of_recordings
-from pipeline.evaluation.held_out.reduced import HELD
+from pipeline.evaluation.held_out.validation import HELD
 from pipeline.output.exports import ExportedUnit, formats
 from pipeline.physics.effects import catalogue
 from pipeline.physics.effects.base import Owner

@@ -13,8 +13,7 @@ from pipeline.app.field_logs.stream import LogProfile
 from pipeline.app.run_progress import Countdown
 from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.files import CONFIGS
-from pipeline.physics.calibration_file import read_calibration
-from pipeline.physics.compensation import SMOOTHING_S, load
+from pipeline.physics.compensation import SMOOTHING_S, load, read_calibration
 
 if TYPE_CHECKING:
     import argparse

@@ -24,8 +24,7 @@ from imu_logs.mcap_write import VECTORS
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS
 from pipeline.ingest.axis_maps import axis_matrix, maps_of_log
-from pipeline.physics.calibration_file import read_calibration
-from pipeline.physics.compensation import SMOOTHING_S, load
+from pipeline.physics.compensation import SMOOTHING_S, load, read_calibration
 from pipeline.physics.measurement import ExponentialRegression
 
 # Sensor to the field of the message, its covariance, and its unit in g or deg/s.

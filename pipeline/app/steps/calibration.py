@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.app.steps.unit_files import StoredUnit
+from pipeline.core import VERSION
 from pipeline.core.errors import CannotCalibrateError, NotObservableError, PipelineError
 from pipeline.core.pack import FAILED_SUFFIX
 from pipeline.core.records import (
@@ -40,7 +41,6 @@ from pipeline.core.records import (
     calibrated,
     coverage_factor,
 )
-from pipeline.core.version import VERSION
 from pipeline.estimation.candidates import MOUNTING
 from pipeline.estimation.chip_fit import Chip
 from pipeline.estimation.chips import chip_document

@@ -23,10 +23,10 @@ from pipeline.app.results_folder import (
     record_units,
 )
 from pipeline.app.steps.summary import failed_files, failed_summary
+from pipeline.core import VERSION
 from pipeline.core.errors import PipelineError, failure_of
 from pipeline.core.files import JSON, flushed_together, read_json, write_atomically, write_json
 from pipeline.core.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch, Pack, as_bytes, batches_of, is_published
-from pipeline.core.version import VERSION
 from pipeline.ingest.files import digests_in_pack
 from pipeline.output.history import of_units, record
 from pipeline.output.pages.campaign_page import render

@@ -26,7 +26,15 @@ wander, and the derivatives with respect to A give the covariance of S, T, M and
 
 are by the trapezoidal rule on the timestamps, so that noise and a delay between reading and reference have little
 effect. A turn is the time in which the table's rate is above a threshold, in one direction, plus the time in which the
-output of a filter still changes. Turns of a sheet have U by their known angles (``known_turns``).
+output of a filter still changes.
+
+Turns of a sheet have ``U = angle e`` by their known angles, and b is the mean of the rests in the turn's own recording,
+otherwise of all rests; the stage ``bias`` of the method is then ``fit_bias``. The errors of A, ``dA = (dY - A dU) W^T``
+with the weights W of the fit, are
+
+    dY : white noise of the turn's samples, and the bias over the turn less that of its rests: white noise of the rests,
+         a Gauss-Markov wander, and the bias of a recording
+    dU : the angle of each turn, and two angles between the stated and the mean axis, common to the turns about it
 """
 
 from __future__ import annotations
@@ -34,16 +42,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipeline.core.errors import NotObservableError
+from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.core.records import (
     AFTER_BASE,
     AXES,
     BASE,
+    BASE_COUNT,
     BIAS,
+    NORMAL,
+    Contribution,
     Index,
     Mask,
     Multiply,
@@ -57,15 +68,33 @@ from pipeline.core.records import (
 )
 from pipeline.core.settings import Settings, Table
 from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative, linear_convergence
-from pipeline.estimation.gyroscope.known_turns import covariances, known_turns, with_budget
+from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.estimation.monte_carlo import with_matrix
+from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
+from pipeline.estimation.multi_position.faces_and_turns import across_axis, turns_of
+from pipeline.estimation.multi_position.gyroscope import between_recordings
 from pipeline.estimation.multi_position.moves import trapezoids
+from pipeline.estimation.multi_position.result import NOT_INCLUDED
 from pipeline.estimation.reference_least_squares import of_channels
+from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.stages import FitStage, StageInput
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, used_motions
-from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
+from pipeline.estimation.uncertainty_budget import (
+    budgeted,
+    clock_line,
+    combined,
+    noise_contribution,
+    scatter_contribution,
+    stage_parameters,
+)
 from pipeline.physics.signal.rests import runs
+
+if TYPE_CHECKING:
+    from pipeline.core.records import UnitRecordings, Values
+    from pipeline.core.settings import Settings
+    from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand
+    from pipeline.estimation.rest_means import Rests
 
 NAME = "cholesky_lu"
 FIT_STAGES = {
@@ -78,6 +107,7 @@ MOTION_SHARE = 0.01  # of the largest rate, above which the table turns
 MIN_RATE_DPS = 0.02  # five times Earth's rotation, which a log may contain
 DELAYS_TO_SETTLE = 5.0  # after which an RC filter holds less than 1 % of a change of rate
 SMALLEST_ANGLE_DEG = 1.0  # a smaller turn hardly determines the matrix
+ANGLES = "angles and axes of the turns"  # a source of the uncertainty budget
 
 
 class Factors(NamedTuple):
@@ -94,17 +124,15 @@ class Forward(NamedTuple):
     turns: TurnIntegrals
     Y: Values  # (t, 3), deg; readings less bias, integrated over each turn
     U: Values  # (t, 3), deg; rates
-    columns: ScaledColumns  # of U
     A: Values  # (3, 3)
 
 
 def forward_of(recordings: Sequence[Recording], bias: Values, table: Table) -> Forward:
     """Return the forward matrix of recordings without its uncertainty."""
-    turns = turns_of(parts_of(recordings, "gyroscope", table, "the Cholesky and LU method"))
+    turns = integrals_of(parts_of(recordings, "gyroscope", table, "the Cholesky and LU method"))
     Y, U = turns.integral(turns.reading - bias), turns.integral(turns.rate)
     require_turns(U)
-    columns = ScaledColumns.of(U)
-    return Forward(turns, Y, U, columns, columns.solve(Y).T)
+    return Forward(turns, Y, U, ScaledColumns.of(U).solve(Y).T)
 
 
 def fit(task: StageInput) -> SensorCalibration:
@@ -116,9 +144,8 @@ def fit(task: StageInput) -> SensorCalibration:
     assert previous is not None  # noqa: S101  (it needs the bias: FIT_STAGES)
     if settings.procedure.sheet is not None:
         return _fit_of_sheet(recordings, previous, settings)
-    turns, Y, U, columns, A = forward_of(recordings.filtered, previous.bias, settings.table)
+    turns, Y, U, A = forward_of(recordings.filtered, previous.bias, settings.table)
     as_printed = settings.method.as_printed
-    factors = factorise(A)
     residuals = turns.reading - previous.bias - turns.rate @ A.T
     design = np.column_stack([np.ones(len(turns.rate)), turns.rate])
     fit, of_bias = _linear_map(turns, A, previous, as_printed=as_printed)
@@ -133,29 +160,14 @@ def fit(task: StageInput) -> SensorCalibration:
     ]
     after = (turns.reading - previous.bias) @ matrix.T
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(turns.rate, axis=1)
-    result = StageResult(
-        name=NAME,
-        parameters=stage_parameters(_values(factors), (scatter.covariance + of_bias)[AFTER_BASE, AFTER_BASE]),
-        residual_rms=float(np.sqrt(np.mean(error**2))),
-        correction=(Subtract(previous.bias), Multiply(matrix)),
-        details=StageDetails(
-            turns=len(U),
-            turns_left_out=turns.left_out,
-            samples_used=len(turns.reading),
-            angle_error_rms_deg=angle_errors,
-            orthonormality_error=float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
-            determinant_of_M=float(np.linalg.det(factors.M)),
-            condition=float(np.linalg.cond(U / np.linalg.norm(U, axis=0))),
-            degrees_of_freedom=float(scatter.degrees_of_freedom.min()),
-        ),
+    details = StageDetails(
+        turns_left_out=turns.left_out,
+        samples_used=len(turns.reading),
+        angle_error_rms_deg=angle_errors,
+        degrees_of_freedom=float(scatter.degrees_of_freedom.min()),
     )
-    found = SensorCalibration(
-        sensor="gyroscope",
-        bias=previous.bias,
-        matrix=matrix,
-        stages=(*previous.stages, result),
-        convergence=linear_convergence(U, Y - U @ A.T, columns.condition, columns.rank),
-    )
+    rms = float(np.sqrt(np.mean(error**2)))
+    found = _calibration(previous, Y, U, A, matrix, scatter.covariance + of_bias, rms, details)
     lines = [scatter.of(BASE)]
     if np.any(of_bias):
         before = np.inf if previous.freedom is None else float(previous.freedom[BIAS].min())
@@ -179,30 +191,37 @@ def _fit_of_sheet(recordings: UnitRecordings, previous: SensorCalibration, setti
     theta = np.column_stack([previous.bias, A]).ravel()
     results = partial(_results, as_printed=as_printed)
     J = derivative(results, theta, np.full(theta.size, DIFFERENCE_STEP))
-    factors, after = factorise(A), J @ (of_noise + of_stated) @ J.T
     matrix, left = calibration_matrix(A, as_printed=as_printed), known.Y - known.U @ A.T
-    stage = StageResult(
-        name=NAME,
-        parameters=stage_parameters(_values(factors), after[AFTER_BASE, AFTER_BASE]),
-        residual_rms=float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
-        correction=(Subtract(previous.bias), Multiply(matrix)),
-        details=StageDetails(
-            turns=len(known.U),
-            rests=len(known.rests.time),
-            orthonormality_error=float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
-            determinant_of_M=float(np.linalg.det(factors.M)),
-            condition=float(np.linalg.cond(known.U / np.linalg.norm(known.U, axis=0))),
-        ),
-    )
-    found = SensorCalibration(
-        sensor="gyroscope",
-        bias=previous.bias,
-        matrix=matrix,
-        stages=(*previous.stages, stage),
-        convergence=linear_convergence(known.U, left, columns.condition, columns.rank),
-    )
+    rms, details = float(np.sqrt(np.mean(np.sum(left**2, axis=1)))), StageDetails(rests=len(known.rests.time))
+    found = _calibration(previous, known.Y, known.U, A, matrix, J @ (of_noise + of_stated) @ J.T, rms, details)
     base = J[BASE]
     return with_budget(found, base @ of_noise @ base.T, base @ of_stated @ base.T, settings)
+
+
+def _calibration(  # noqa: PLR0917  (of one stage)
+    previous: SensorCalibration,
+    Y: Values,
+    U: Values,
+    A: Values,
+    matrix: Values,
+    covariance: Values,
+    rms: float,
+    details: StageDetails,
+) -> SensorCalibration:
+    """Return the calibration after the stage; ``covariance``: of bias, matrix, S, T and M, (27, 27)."""
+    factors, columns = factorise(A), ScaledColumns.of(U)
+    details = replace(
+        details,
+        turns=len(U),
+        orthonormality_error=float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
+        determinant_of_M=float(np.linalg.det(factors.M)),
+        condition=float(np.linalg.cond(U / np.linalg.norm(U, axis=0))),
+    )
+    parameters = stage_parameters(_values(factors), covariance[AFTER_BASE, AFTER_BASE])
+    stage = StageResult(NAME, parameters, rms, (Subtract(previous.bias), Multiply(matrix)), details)
+    convergence = linear_convergence(U, Y - U @ A.T, columns.condition, columns.rank)
+    stages = (*previous.stages, stage)
+    return SensorCalibration("gyroscope", previous.bias, matrix, stages, convergence=convergence)
 
 
 def factorise(A: Values) -> Factors:
@@ -278,7 +297,7 @@ class TurnIntegrals:
         return np.stack([np.bincount(self.turn[inside], column, size) for column in weighted.T], axis=1)
 
 
-def turns_of(parts: Sequence[TurnPart]) -> TurnIntegrals:
+def integrals_of(parts: Sequence[TurnPart]) -> TurnIntegrals:
     """Stack the samples at rest and in turns of recordings."""
     columns, chosen, found, left_out = [], [], 0, 0
     for part in parts:
@@ -331,3 +350,88 @@ def require_turns(U: Values) -> None:
             f"the gyroscope was not turned {about}: record a turn about each of x, y and z, from rest to rest, at "
             "20 deg/s or more"
         )
+
+
+class KnownTurns(NamedTuple):
+    """The rests and turns of a sheet, and what a fit of the turns needs of them."""
+
+    rests: Rests
+    turns: TurnsByHand
+    Y: Values  # (t, 3), deg
+    U: Values  # (t, 3), deg
+    bias: Values  # (3,), deg/s; of all rests
+    of_bias: Values  # (3,), its variance
+    of_angle: Values  # (3, t, t), covariance of each column of Y
+
+
+def known_turns(recordings: UnitRecordings, settings: Settings) -> KnownTurns:
+    """Return the turns of a sheet; raise ``CannotCalibrateError`` without a rest or a turn."""
+    filtered, noise = recordings.filtered, recordings.noises["gyroscope"]
+    every = rests_of("gyroscope", filtered, settings.procedure)
+    rests = None if every is None or every.held_out.all() else every.select(~every.held_out)
+    turns = turns_of(filtered, rests, None, settings.procedure) if rests is not None else None
+    if rests is None or turns is None or noise is None:
+        raise CannotCalibrateError(
+            "the Cholesky and LU method needs rests, and turns by known angles about x, y and z (kind turn or table)"
+        )
+    white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
+    m, t = len(rests.time), len(turns.stated)
+    own = rests.recording == turns.recording[:, None]
+    chosen = np.concatenate([np.ones((1, m)), np.where(own.any(axis=1, keepdims=True), own, 1.0)]) * rests.count
+    mean, *of_turns = chosen / chosen.sum(axis=1, keepdims=True)
+    length = turns.weight.sum(axis=1)
+    start = np.concatenate([rests.start, turns.time[:, 0]])
+    span = np.concatenate([rests.length, turns.time[:, -1] - turns.time[:, 0]])
+    recording = np.concatenate([rests.recording, turns.recording])
+    same = recording[:, None] == recording
+    wander = np.where(same, block_covariance(start, span, noise.correlation_time), 0.0)
+    between = between_recordings(rests, turns, noise)
+    difference = np.hstack([-np.array(of_turns), np.eye(t)])
+    of_bias, of_angle = np.zeros(3), np.zeros((3, t, t))
+    for c, of_rests in enumerate(rests.variance(white).T):
+        S = noise.wander[c] ** 2 * wander + (between * white[c]) ** 2 * same
+        S[np.arange(m), np.arange(m)] += of_rests
+        of_bias[c] = mean @ S[:m, :m] @ mean
+        of_angle[c] = np.outer(length, length) * (difference @ S @ difference.T)
+        of_angle[c] += np.diag(white[c] ** 2 * np.sum(turns.weight**2, axis=1))
+    Y = np.einsum("ts,tsi->ti", turns.weight, turns.reading) - length[:, None] * (np.array(of_turns) @ rests.reading)
+    return KnownTurns(rests, turns, Y, turns.stated[:, None] * turns.direction, mean @ rests.reading, of_bias, of_angle)
+
+
+def fit_bias(recordings: UnitRecordings, settings: Settings) -> SensorCalibration:
+    """Return the stage ``bias``: the mean of the rests."""
+    known = known_turns(recordings, settings)
+    covariance = np.zeros((BASE_COUNT, BASE_COUNT))
+    covariance[BIAS, BIAS] = np.diag(known.of_bias)
+    values = {f"b_{axis}": (float(b), "deg/s") for axis, b in zip(AXES, known.bias, strict=True)}
+    parameters, details = stage_parameters(values, np.diag(known.of_bias)), StageDetails(rests=len(known.rests.time))
+    stage = StageResult("bias", parameters, correction=(Subtract(known.bias),), details=details)
+    found = SensorCalibration("gyroscope", bias=known.bias, stages=(stage,))
+    return combined(found, [scatter_contribution(covariance, np.inf)], dict(NOT_INCLUDED))
+
+
+def covariances(known: KnownTurns, A: Values, columns: ScaledColumns) -> tuple[Values, Values]:
+    """Return the covariance of bias and A, row by row, by noise and by angles and axes: (12, 12) arrays."""
+    W, turns = columns.weights(), known.turns
+    of_noise, of_stated = np.zeros((BASE_COUNT, BASE_COUNT)), np.zeros((BASE_COUNT, BASE_COUNT))
+    for c, of_angle in enumerate(known.of_angle):
+        of_noise[4 * c, 4 * c] = known.of_bias[c]
+        of_noise[4 * c + 1 : 4 * c + 4, 4 * c + 1 : 4 * c + 4] = W @ of_angle @ W.T
+    t = len(turns.stated)
+    errors: list[Values] = [np.outer(e, d) for e, d in zip(np.diag(turns.error[:t]), turns.direction, strict=True)]
+    for k, first in enumerate(np.unique(turns.group)):
+        signed = np.where(turns.group == first, turns.stated * np.sign(turns.direction @ turns.direction[first]), 0.0)
+        size = np.radians(turns.error[t + 2 * k])
+        errors += [np.outer(signed * size, v) for v in across_axis(turns.direction[first])]
+    for dU in errors:
+        change = np.hstack([np.zeros((3, 1)), A @ dU.T @ W.T]).ravel()
+        of_stated += np.outer(change, change)
+    return of_noise, of_stated
+
+
+def with_budget(found: SensorCalibration, of_noise: Values, of_stated: Values, settings: Settings) -> SensorCalibration:
+    """Return a calibration with its budget; both covariances are of bias and matrix, (12, 12)."""
+    noise = scatter_contribution(of_noise, np.inf, remark="white noise, bias wander, and the bias of each recording")
+    angles = Contribution(ANGLES, "B", NORMAL, of_stated, np.full(BASE_COUNT, np.inf))
+    clock, missing = clock_line(found, settings.table)
+    return combined(found, [noise, angles, *clock], NOT_INCLUDED | missing)

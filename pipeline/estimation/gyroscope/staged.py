@@ -175,7 +175,7 @@ def fit(task: StageInput) -> SensorCalibration:
     """
     name, recordings, previous, settings = task.stage, task.recordings, task.previous, task.settings
     if settings.procedure.sheet is not None and name == "bias":
-        from pipeline.estimation.gyroscope.known_turns import fit_bias  # noqa: PLC0415  (only for turns of a sheet)
+        from pipeline.estimation.gyroscope.cholesky_lu import fit_bias  # noqa: PLC0415  (only for turns of a sheet)
 
         return fit_bias(recordings, settings)
     prior, before = task.prior, [stage.name for stage in task.stages]

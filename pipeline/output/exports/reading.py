@@ -49,8 +49,7 @@ from pipeline.ingest.axis_maps import STRAIGHT, maps_of_log
 from pipeline.output.exports import ExportedUnit, Format, export, formats, text_of
 from pipeline.output.exports.sensors import SI, TEMPLATE_FUNCTIONS, UNIT_FACTORS, SensorFigures, before_use
 from pipeline.output.exports.text_kinds import Expressions, Node, parsed
-from pipeline.physics.calibration_file import read_calibration, sensor_of
-from pipeline.physics.compensation import Compensation
+from pipeline.physics.compensation import Compensation, read_calibration, sensor_of
 from pipeline.physics.effects import effect, effect_of
 from pipeline.physics.measurement import sensor_effects
 

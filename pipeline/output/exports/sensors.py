@@ -32,7 +32,7 @@ from pipeline.core.records import AXES, BIAS, SENSORS, Reduced, SensorCalibratio
 from pipeline.core.settings import DataSheet
 from pipeline.estimation.noise_terms import allan_variance
 from pipeline.ingest.axis_maps import STRAIGHT, maps_of_log
-from pipeline.physics.calibration_file import MIN_EXPORTED_TIME_S
+from pipeline.physics.compensation import MIN_EXPORTED_TIME_S
 from pipeline.physics.effects import owner_of
 from pipeline.physics.effects.base import OF_THE_BIAS, REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
 from pipeline.physics.statements import sentences
