@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 
@@ -12,6 +12,8 @@ from pipeline.core.files import state_of_files
 from pipeline.core.user_cache import from_cache, to_cache
 
 if TYPE_CHECKING:
+    from collections.abc import MutableMapping
+
     from jinja2.bccache import Bucket
 
 
@@ -32,6 +34,29 @@ class CompiledTemplates(jinja2.BytecodeCache):
     def dump_bytecode(self, bucket: Bucket) -> None:
         """Store the code of a template."""
         to_cache(bucket.key, _state(bucket), bucket.code)
+
+
+class Templates(jinja2.Environment):
+    """The templates of a package. Its globals are complete before the first is loaded.
+
+    A name is looked up in a dict before its methods, because most names of the templates are keys.
+    """
+
+    def __init__(self, package: str, loader: jinja2.BaseLoader, **options: Any) -> None:  # noqa: ANN401  (of jinja2)
+        compiled = CompiledTemplates(package)
+        super().__init__(
+            loader=loader, auto_reload=False, bytecode_cache=compiled, trim_blocks=True, lstrip_blocks=True, **options
+        )
+
+    def getattr(self, obj: Any, attribute: str) -> Any:  # noqa: ANN401  (as of the base class)
+        """Return a value of a dict, or an attribute."""
+        if type(obj) is dict and attribute in obj:
+            return obj[attribute]
+        return super().getattr(obj, attribute)
+
+    def make_globals(self, d: MutableMapping[str, object] | None) -> MutableMapping[str, object]:
+        """Return the globals of a template as a dict, which each rendering copies faster than a chain of two."""
+        return {**self.globals, **(d or {})}
 
 
 def _state(bucket: Bucket) -> str:

@@ -26,6 +26,10 @@ class Unit:
     settings: Settings
 
     @property
+    def fit(self) -> SensorCalibration:
+        return SensorCalibration.from_json("accelerometer", self.calibration["accelerometer"])
+
+    @property
     def arguments(self) -> tuple[Any, ...]:
         return self.calibration, self.validation, self.diagnosis, self.recordings, self.settings
 

@@ -197,7 +197,7 @@ def test_the_rows_of_the_noise_give_intervals_or_upper_limits_and_say_what_is_to
 
 
 def test_noise_alone_stays_below_the_dashes_of_the_harmonics(unit: Unit) -> None:
-    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings.table)[0]
+    found = residuals(unit.fit, unit.recordings, unit.settings.table)[0]
     rng, sigma = np.random.default_rng(21), np.full(3, SIGMA["accelerometer"])
     level = harmonic_noise(found, sigma, np.zeros(3), 100.0)
     above = 0
@@ -211,7 +211,7 @@ def test_noise_alone_stays_below_the_dashes_of_the_harmonics(unit: Unit) -> None
 
 
 def test_the_covariate_that_matters_comes_first_and_says_its_size(unit: Unit) -> None:
-    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings.table)
+    found = residuals(unit.fit, unit.recordings, unit.settings.table)
     rng, sigma = np.random.default_rng(6), SIGMA["accelerometer"]
     noise = {"white": [sigma] * 3, "wander": [1e-4] * 3, "correlation_time_s": 100.0}
     made = []
@@ -236,7 +236,7 @@ def test_the_covariate_that_matters_comes_first_and_says_its_size(unit: Unit) ->
 
 
 def test_a_harmonic_above_the_noise_is_named(unit: Unit) -> None:
-    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings.table)
+    found = residuals(unit.fit, unit.recordings, unit.settings.table)
     findings = [f.finding for f in residual_figures("accelerometer", found, None)]
     assert any(re.match(r"accel_\w: 2 cycles a turn on \w, 0.00\d+ g, above the noise", f) for f in findings)
 

@@ -16,7 +16,7 @@ def unit() -> Unit:
 
 
 def test_a_hidden_quadratic_shows_as_a_constant_and_two_cycles_a_turn(unit: Unit) -> None:
-    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings.table)
+    found = residuals(unit.fit, unit.recordings, unit.settings.table)
     assert [r.recording.name for r in found] == ["accel_x", "accel_y", "accel_z"]
     amplitudes = harmonics(found[0])
     assert amplitudes is not None
@@ -31,7 +31,7 @@ def test_a_filters_lag_is_no_residual(unit: Unit) -> None:
     lag = 1.0
     settings = settings_of(**{"filter.name": "rc_low_pass", "filter.time_constant_s": lag}).filter
     turns = [apply_filter(r, settings) for r in unit.recordings[:3]]
-    for residual in residuals("accelerometer", unit.calibration["accelerometer"], turns, unit.settings.table):
+    for residual in residuals(unit.fit, turns, unit.settings.table):
         amplitudes = harmonics(residual)
         assert amplitudes is not None
         of_the_lag = np.radians(lag * residual.motion.angular_rate.max())  # 1 g turns by this angle in the lag

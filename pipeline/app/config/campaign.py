@@ -97,6 +97,11 @@ class Campaign:
         return boards_of(self.units)
 
     @property
+    def packed(self) -> bool:
+        """Whether the files of the units are published in packs."""
+        return len(self.units) > self.publish_limit
+
+    @property
     def recorded(self) -> Path:
         """Folder of the recordings: the campaign's directory, or a folder of the results if they are simulated."""
         return self.directory if self.simulation is None else self.results.absolute() / "simulated"

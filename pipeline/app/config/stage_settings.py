@@ -127,7 +127,7 @@ def settings_of_jobs(
         "compare": campaign.compare,
         "page": campaign.page,
         "combine": campaign.combine,
-        "publish_limit": campaign.publish_limit,
+        "packed": campaign.packed,
         "truths": {unit: str(campaign.truth(unit)) for unit in compared},
     }
     files[CAMPAIGN] = {"gather": _file("gather", of_gather, again(""))}
@@ -158,6 +158,8 @@ def _content(
         content["last"] = {row.name: last_stage(row.config, sensor) for row in rows}
     if stage in ("ingest", "report"):
         content["campaign"] = campaign.name
+    if stage == "report":
+        content["packed"] = campaign.packed
     if stage == "ingest":
         content |= {"directory": str(campaign.recorded), "recordings": _recordings(campaign, rows)}
     return content

@@ -50,7 +50,8 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
 OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous")}
 AFTER_FIT = ("diagnose", "export", "report", "summary", "prior")  # a calibration does not depend on them
 INPUTS_OF = ".inputs"  # member of a pack: digest of a unit's inputs, and the names of its files
-OF_OTHERS = ("again", "recordings", "last")  # settings by unit, of which ``<stage>_reads`` returns those of one
+# settings by unit, of which ``<stage>_reads`` returns those of one, and how a pack is written
+OF_OTHERS = ("again", "recordings", "last", "packed")
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def main(stage: str, argv: Sequence[str]) -> int:
         return 0
     edited = job.run.get("again", 0) != repetitions(job.results, _below(job, job.output))[0]
     last = None if edited else _last_pack(job.output)
-    with new_pack(job.output) as add:
+    with new_pack(job.output, (".parquet",) if job.run.get("packed", True) else (".parquet", ".html")) as add:
         for number, (unit, settings) in enumerate(job.units.items(), 1):
             print(f"{stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
             inputs = _inputs_of(module, job, unit, settings)

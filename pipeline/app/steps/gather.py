@@ -60,7 +60,7 @@ def gather_batch(job: Job) -> None:
     for name in PUBLISHED_PATHS:
         if "." not in name:
             (new / name).mkdir(parents=True)
-    packed = len(run["order"]) > run["publish_limit"]
+    packed = run["packed"]
     asked = asked_units(results)
     found: dict[str, JSON] = {}
     parts: list[pd.DataFrame] = []

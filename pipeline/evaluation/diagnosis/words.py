@@ -6,9 +6,9 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment, FileSystemLoader, Template
+from jinja2 import FileSystemLoader, Template
 
-from pipeline.core.compiled_templates import CompiledTemplates
+from pipeline.core.compiled_templates import Templates
 from pipeline.core.records import Answer
 from pipeline.core.verdicts import Verdict, figure_and_size
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed
@@ -49,15 +49,8 @@ PLUS_MINUS = (
 
 
 @cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        auto_reload=False,
-        bytecode_cache=CompiledTemplates("diagnosis"),
-        autoescape=False,  # noqa: S701  (no HTML)
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+def _environment() -> Templates:
+    environment = Templates("diagnosis", FileSystemLoader(Path(__file__).parent / "templates"))  # no HTML
     environment.filters |= {"plain": plain, "listed": listed, "said": lambda answer: _said(Answer(**answer))}
     environment.globals |= {
         "is_fixed": is_fixed,

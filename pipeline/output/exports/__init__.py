@@ -34,7 +34,7 @@ from typing import Any, Literal
 import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
-from pipeline.core.compiled_templates import CompiledTemplates
+from pipeline.core.compiled_templates import Templates
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import JSON, Check, WrongValueError, each, fields, one_of
 from pipeline.core.records import SENSORS, FittedEffect, Quantities, Reduced, SensorCalibration, as_json
@@ -96,14 +96,10 @@ class _Texts(FileSystemLoader):
 
 
 @cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        auto_reload=False,
-        bytecode_cache=CompiledTemplates("exports"),
-        autoescape=False,  # noqa: S701  (no HTML; each comment filter closes its own comments)
-        trim_blocks=True,
-        lstrip_blocks=True,
+def _environment() -> Templates:
+    environment = Templates(  # no HTML; each comment filter closes its own comments
+        "exports",
+        FileSystemLoader(TEMPLATES),
         keep_trailing_newline=True,
         undefined=StrictUndefined,
         extensions=["jinja2.ext.do"],

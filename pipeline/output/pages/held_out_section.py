@@ -37,6 +37,8 @@ from pipeline.output.pages.group_charts import Point, bars
 from pipeline.output.pages.pages import number, percent
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pipeline.core.files import JSON
     from pipeline.core.settings import DataSheet, Table
     from pipeline.output.pages.pages import Scale
@@ -149,13 +151,12 @@ def _exact(found: JSON) -> bool:
 
 
 def held_out_figures(
-    sensor: str, calibration: JSON, held_out: JSON, recordings: list[Recording], table: Table
+    sensor: str, fits: Mapping[str, SensorCalibration], held_out: JSON, recordings: list[Recording], table: Table
 ) -> list[Figure]:
     """Draw the error of the magnitude in each held-out recording with a reference, as in the validation.
 
-    ``held_out``: the sensor's part of the validation.
+    ``fits``: of the calibrated sensors; ``held_out``: the sensor's part of the validation.
     """
-    fits = {s: SensorCalibration.from_json(s, calibration[s]) for s in SENSORS if calibration.get(s)}
     floor, by_hand, figures = held_out.get("noise_floor"), table.motion == "none", []
     for recording in (r for r in recordings if r.role == "validation"):
         logged = sensor == "accelerometer" or (recording.table_rate is not None and table.latitude_deg is None)

@@ -16,10 +16,10 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
-from jinja2 import Environment, FileSystemLoader, Template, select_autoescape
+from jinja2 import FileSystemLoader, Template, select_autoescape
 from markupsafe import Markup
 
-from pipeline.core.compiled_templates import CompiledTemplates
+from pipeline.core.compiled_templates import Templates
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import is_fixed
 from pipeline.evaluation.diagnosis.words import plain
@@ -188,25 +188,10 @@ def _figure(value: object, scale: Scale | None = None) -> str:
     return number(value / (scale.factor if scale else 1.0)) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
 
 
-class _Environment(Environment):
-    """Looks a name up in a dict before its methods: most names of the templates are keys."""
-
-    def getattr(self, obj: Any, attribute: str) -> Any:  # noqa: ANN401  (as of the base class)
-        if type(obj) is dict and attribute in obj:
-            return obj[attribute]
-        return super().getattr(obj, attribute)
-
-
 @cache
-def _environment() -> Environment:
-    environment = _Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        auto_reload=False,
-        bytecode_cache=CompiledTemplates("report"),
-        autoescape=select_autoescape(disabled_extensions=["md", "txt", "yaml"], default=True),
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+def _environment() -> Templates:
+    escaped = select_autoescape(disabled_extensions=["md", "txt", "yaml"], default=True)
+    environment = Templates("report", FileSystemLoader(TEMPLATES), autoescape=escaped)
     of_numbers = (aligned, in_unit, measured, number, percent, percent_change, probability, span, typeset)
     environment.filters |= {one.__name__: one for one in of_numbers}
     environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text}

@@ -120,11 +120,16 @@ class Residual:
         """Reading minus prediction: (n, 3) array, g or deg/s."""
         return self.reading - self.predicted
 
+    @cached_property
+    def angle_bins(self) -> tuple[Integers, Integers]:
+        """The bin, of 36 in a turn, of each angle, and the number of angles in each bin."""
+        cell = (np.mod(np.asarray(self.motion.angle), 360.0) * (RESIDUAL_BINS / 360.0)).astype(np.int64) % RESIDUAL_BINS
+        return cell, np.bincount(cell, minlength=RESIDUAL_BINS)
 
-def residuals(sensor: str, part: JSON, recordings: list[Recording], table: Table) -> list[Residual]:
-    """Return the residuals of the recordings for a sensor whose motion is known; ``part``: of its calibration."""
-    calibration = SensorCalibration.from_json(sensor, part)
-    out = []
+
+def residuals(calibration: SensorCalibration, recordings: list[Recording], table: Table) -> list[Residual]:
+    """Return the residuals of the recordings for a sensor whose motion is known."""
+    sensor, out = calibration.sensor, []
     for recording in recordings:
         reading = recording.reading(sensor) if recording.role == sensor else None
         motion = None if reading is None else table_motion(recording, table)
@@ -215,21 +220,14 @@ def covariates(found: list[Residual], wander: Values) -> dict[str, _BinnedMean]:
     return {label: out[label] for label in order if label not in forces[1:]}
 
 
-def _angle_bins(angle: Values) -> tuple[Integers, Integers]:
-    """Return the bin, of 36 in a turn, of each of (n,) angles (deg), and the number of angles in each bin."""
-    cell = (np.mod(angle, 360.0) * (RESIDUAL_BINS / 360.0)).astype(np.int64) % RESIDUAL_BINS
-    return cell, np.bincount(cell, minlength=RESIDUAL_BINS)
-
-
 def harmonics(residual: Residual) -> Values | None:
     """Return the amplitudes of 0 to 12 cycles a turn: (13, 3) array, None where a bin of the turn has no sample.
 
     They are computed from means in 36 bins of the angle; the division by ``sinc`` corrects for averaging over a bin.
     """
-    angle = residual.motion.angle
-    if angle is None:
+    if residual.motion.angle is None:
         return None
-    cell, count = _angle_bins(angle)
+    cell, count = residual.angle_bins
     if not count.all():
         return None
     mean = np.stack([np.bincount(cell, e, RESIDUAL_BINS) / count for e in residual.error.T], 1)
@@ -252,9 +250,7 @@ def harmonic_noise(residual: Residual, white: Values, wander: Values, time: floa
     turns = max(float(np.abs(np.diff(motion.angle)).sum()) / 360.0, 1.0)
     frequency = np.arange(HARMONICS + 1) * turns / duration
     spectrum = 2.0 * float(wander.max()) ** 2 * time / (1.0 + (2.0 * np.pi * frequency * time) ** 2)
-    of_white = (
-        float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(_angle_bins(motion.angle)[1], 1))) / RESIDUAL_BINS
-    )
+    of_white = float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(residual.angle_bins[1], 1))) / RESIDUAL_BINS
     spread = np.sqrt(2.0 * of_white + 2.0 * spectrum / duration)
     spread[0] = np.hypot(np.sqrt(of_white), wander.max())  # a mean, not an amplitude
     return np.asarray(ONE_IN_A_THOUSAND * spread)
@@ -366,8 +362,9 @@ def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:
     exclude an effect of the size of that limit, and no answer of the answer set contains it.
     """
     rows, open_effects = [], {name for answer in found.get("answer_set") or [] for name in answer["effects"]}
+    known = catalogue()
     for name, limits in (found.get("upper_limit") or {}).items():
-        effect = catalogue().get(name)
+        effect = known.get(name)
         stated: dict[str, float] = {}
         if effect is not None:
             values = parameter_limits(effect, sensor, data_sheet.effects).tolist()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.files import JSON, json_text
-from pipeline.core.records import AXES, BIAS, MATRIX, SENSOR_UNITS, SENSORS, Recording, Values
+from pipeline.core.records import AXES, BIAS, MATRIX, SENSOR_UNITS, SENSORS, Recording, SensorCalibration, Values
 from pipeline.core.verdicts import (
     KINDS,
     MARK_ABOVE_FLOORS,
@@ -51,7 +51,7 @@ from pipeline.physics.signal.rests import Rest, rests_from_table
 from pipeline.physics.statements import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.core.settings import Settings
 
@@ -93,6 +93,7 @@ def render(
         "table": settings.table,
         "filter": settings.filter.name,
     }
+    fits = {s: SensorCalibration.from_json(s, calibration[s]) for s in SENSORS if ok and calibration.get(s)}
     sensors = []
     for sensor in SENSORS if ok else ():
         shown = {"name": sensor, "unit": SENSOR_UNITS[sensor], "part": calibration.get(sensor)}
@@ -100,7 +101,7 @@ def render(
             shown["reason"] = calibration.get("not_calibrated", {}).get(sensor, "the procedure does not calibrate it")
         else:
             found = diagnosis.get(sensor) or {}
-            shown |= _sensor(sensor, calibration, validation, found, recordings=recordings, settings=settings)
+            shown |= _sensor(sensor, calibration, validation, found, fits, recordings=recordings, settings=settings)
             shown |= _sentences(words.get(sensor) or [], found)
         sensors.append(shown)
     page: str = template("unit.html").render(
@@ -143,12 +144,13 @@ def found_mounting(calibration: JSON) -> JSON | None:
 
 
 def _sensor(
-    sensor: str, calibration: JSON, validation: JSON, found: JSON, *, recordings: list[Recording], settings: Settings
-) -> JSON:
+    sensor: str, calibration: JSON, validation: JSON, found: JSON, fits: Mapping[str, SensorCalibration],
+    *, recordings: list[Recording], settings: Settings,
+) -> JSON:  # fmt: skip
     """Return what the template shows of a calibrated sensor; ``found``: its part of the diagnosis."""
     part, held_out, table = calibration[sensor], validation.get(sensor) or {}, settings.table
     data_sheet = settings.sensor.of(sensor)
-    noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
+    noise, traces = found.get("noise") or held_out.get("noise"), residuals(fits[sensor], recordings, table)
     error = error_of(held_out)
     scale = scale_of(SENSOR_UNITS[sensor], error.after, error.floor)
     at_rest = (calibration.get("noise") or {}).get(sensor)
@@ -174,7 +176,7 @@ def _sensor(
         "why_figures": [cause, steps[error.kind]],
         "step_figures": [figure for kind, figure in steps.items() if kind != error.kind],
         "model_figures": [measurement_and_model(sensor, r, noise) for r in traces],
-        "held_out_figures": held_out_figures(sensor, calibration, held_out, recordings, table),
+        "held_out_figures": held_out_figures(sensor, fits, held_out, recordings, table),
         "residual_figures": [figure for figure in dependence if figure is not cause],
         "noise_figure": allan(sensor, at_rest, data_sheet, found.get("wander")),
         "noise_terms": term_rows(at_rest),
