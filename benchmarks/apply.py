@@ -116,7 +116,7 @@ def csv_unchanged(log: Path, out: Path, _calibration: Path) -> int:
 
 
 def csv_applied(log: Path, out: Path, calibration: Path) -> int:
-    from pipeline.app.field_logs.compensate import compensate_log  # noqa: PLC0415
+    from pipeline.app.field_logs.stream import compensate_log  # noqa: PLC0415
     from pipeline.physics.compensation import load  # noqa: PLC0415
 
     return compensate_log(load(calibration), log, out).samples
@@ -145,7 +145,7 @@ def mcap_unchanged(log: Path, out: Path, _calibration: Path) -> int:
 
 
 def mcap_applied(log: Path, out: Path, calibration: Path) -> int:
-    from pipeline.app.field_logs.compensate import compensate_log  # noqa: PLC0415
+    from pipeline.app.field_logs.stream import compensate_log  # noqa: PLC0415
     from pipeline.physics.compensation import load  # noqa: PLC0415
 
     return compensate_log(load(calibration), log, out).samples

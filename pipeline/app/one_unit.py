@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from ctypes import CDLL
 from dataclasses import dataclass, field, replace
@@ -37,8 +37,8 @@ from pipeline.core.errors import (
 )
 from pipeline.core.files import write_atomically
 from pipeline.core.pack import as_bytes
-from pipeline.core.records import SENSOR_UNITS, SENSORS, Values
-from pipeline.core.settings import UserEffectFiles
+from pipeline.core.records import SENSOR_UNITS, SENSORS, Recording, Values
+from pipeline.core.settings import Settings, UserEffectFiles
 from pipeline.core.verdicts import error_of
 from pipeline.ingest.axis_maps import in_body_axes, maps_of_log
 from pipeline.ingest.files import SHEET, candidate_files, sheet_of_mapping, with_sheet, wrong_name
@@ -49,12 +49,7 @@ from pipeline.physics.effects import registered
 from pipeline.unit import Task, UnitFiles, UnitState, run_step, run_steps, tasks_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
     import pandas as pd
-
-    from pipeline.core.records import Recording
-    from pipeline.core.settings import Settings
 
     Paths = Sequence[str | os.PathLike[str]]
     Recordings = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str] | pd.DataFrame]

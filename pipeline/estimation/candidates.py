@@ -11,7 +11,7 @@ from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.design import MAX_BEND_SHARE_OF_ROOM, Bend, EffectColumns, NormalPrior, placed
 from pipeline.estimation.gates import possible
 from pipeline.physics.effects import catalogue, effect, stated_priors
-from pipeline.physics.effects.base import parameter_limits
+from pipeline.physics.effects.base import Effect, parameter_limits
 from pipeline.physics.effects.mounting import SETUP_EFFECTS
 from pipeline.physics.signal.filters import MIN_SWING_DEGC, heats_and_cools
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from pipeline.core.records import Motion, Recording, SensorCalibration, Values
     from pipeline.core.settings import DataSheet, Settings, Table
     from pipeline.estimation.observations import Observations
-    from pipeline.physics.effects.base import Effect
 
 NO_SWING = f"the temperature does not rise and fall by {MIN_SWING_DEGC:g} degC while it is recorded"
 AUTO = "auto"  # instead of a list of effects: the effects that the diagnosis selects

@@ -19,11 +19,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.core.records import coverage_factor
+from pipeline.core.records import Values, coverage_factor
 from pipeline.physics.effects import effect
 
 if TYPE_CHECKING:
-    from pipeline.core.records import Values
     from pipeline.estimation.ranking import Score
     from pipeline.physics.effects.base import Effect
 

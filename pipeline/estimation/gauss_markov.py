@@ -26,17 +26,15 @@ Thompson, Biometrika 58, 1971 (restricted likelihood).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.core.records import Index, Integers, Noise, Values
+from pipeline.core.records import Index, Integers, Noise, Values
 
 DEFAULT_TIME_S = 100.0  # correlation time if the sensor file gives none: of MEMS sensors, by IEEE Std 952 examples
 STATED_WIDTH = float(np.log(3.0))  # of the logarithm of a bias instability that a sensor file gives: a factor of three

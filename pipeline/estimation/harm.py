@@ -21,8 +21,8 @@ import numpy as np
 import scipy
 
 from pipeline.estimation.gauss_markov import block_covariance
-from pipeline.estimation.generalized_least_squares import fit_terms
-from pipeline.estimation.multi_position.fit import COMPARED_STEP, fit
+from pipeline.estimation.generalized_least_squares import JointFit, fit_terms
+from pipeline.estimation.multi_position.fit import COMPARED_STEP, FitByHand, fit
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.observations import without_rows
 from pipeline.estimation.ranking import projection
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
 
     from pipeline.core.records import Mask, Noise, Values
-    from pipeline.estimation.generalized_least_squares import JointFit
-    from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.multi_position.model import Model
     from pipeline.estimation.multi_position.selection import SelectionByHand
     from pipeline.estimation.selection import Selection

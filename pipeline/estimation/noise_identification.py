@@ -27,11 +27,12 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import scipy
 
-from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS
+from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Recording, Values
 from pipeline.estimation.noise_search import (
     ONE_SIDED,
     QUANTILE,
     CompositionSearch,
+    FittedComposition,
     Regression,
     RestStretch,
     best_of,
@@ -44,6 +45,7 @@ from pipeline.estimation.noise_terms import (
     STOCHASTIC,
     WALK,
     WHITE,
+    Spectrum,
     TermTrial,
     allan_deviation,
     allan_variance,
@@ -61,9 +63,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.core.files import JSON
-    from pipeline.core.records import Recording, Values
-    from pipeline.estimation.noise_search import FittedComposition
-    from pipeline.estimation.noise_terms import Spectrum
 
 
 MIN_SPECTRUM_SAMPLES = 60  # which determine the white noise to a tenth

@@ -23,13 +23,13 @@ of a term that is not in the composition is the coefficient at which -2 log L of
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.records import median
+from pipeline.core.records import Values, median
 from pipeline.estimation.noise_terms import (
     LONGEST_TIME,
     MARKOV,
@@ -37,8 +37,10 @@ from pipeline.estimation.noise_terms import (
     STOCHASTIC,
     WHITE,
     Composition,
+    Spectrum,
     TermFits,
     TermTrial,
+    Work,
     active,
     at_once,
     evaluate,
@@ -46,12 +48,6 @@ from pipeline.estimation.noise_terms import (
     solved,
     spectrum_of,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.core.records import Values
-    from pipeline.estimation.noise_terms import Spectrum, Work
 
 MOST_MARKOV = 2  # processes of different correlation times; to distinguish a third takes some 10^6 samples
 TIMES_SCORED = 10  # correlation times whose score is computed, in equal steps of their logarithm

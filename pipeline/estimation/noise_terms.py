@@ -39,18 +39,16 @@ Whittle 1953; Patterson & Thompson, Biometrika 58, 1971.
 
 from __future__ import annotations
 
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import accumulate
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import scipy
 
-if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
-
-    from pipeline.core.records import Integers, Mask, Values
+from pipeline.core.records import Integers, Mask, Values
 
 QUANTISATION, WHITE, INSTABILITY, WALK, MARKOV = range(5)
 PER_AVERAGE = 64  # overlapping terms of the sum in one average
@@ -258,8 +256,7 @@ class TermFits:
 
 
 FIT_FIELDS = tuple(f.name for f in fields(TermFits))
-if TYPE_CHECKING:
-    Work = Generator[list[TermTrial], TermFits, Result]  # yields trials, receives their fits, returns a result
+Work = Generator[list[TermTrial], TermFits, Result]  # yields trials, receives their fits, returns a result
 
 
 def active(kinds: Integers) -> Mask:

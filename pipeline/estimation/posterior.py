@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.core.records import BASE_COUNT
+from pipeline.core.records import BASE_COUNT, Values
 from pipeline.estimation.candidates import SECOND, SECOND_SHARE, time_constants
 from pipeline.estimation.design import BEND, Design, EffectColumns, placed
 from pipeline.estimation.evidence import (
@@ -50,7 +50,6 @@ from pipeline.estimation.selection import DELAYS, Selection
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
-    from pipeline.core.records import Values
     from pipeline.physics.effects.base import Effect
 
 

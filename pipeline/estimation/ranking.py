@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.core.records import BASE_COUNT, standard_uncertainty
+from pipeline.core.records import BASE_COUNT, Index, Values, standard_uncertainty
 from pipeline.estimation.design import Design, EffectColumns, Start
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, random_walks
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 
-    from pipeline.core.records import Index, Values
     from pipeline.estimation.observations import Observations
 
 MIN_NEW_COLUMN_SHARE = 1e-3  # share of a column's norm, after projection of the base, from which on it is determined

@@ -36,7 +36,9 @@ from pipeline.core.records import (
     Contribution,
     Estimate,
     FittedEffect,
+    Index,
     Multiply,
+    Noise,
     NoiseParts,
     SensorCalibration,
     StageDetails,
@@ -46,12 +48,12 @@ from pipeline.core.records import (
     Values,
     base_values,
 )
-from pipeline.estimation.engine import ScaledColumns, linear_convergence
-from pipeline.estimation.gauss_markov import block_covariance
+from pipeline.estimation.engine import ResidualNoise, ScaledColumns, linear_convergence
+from pipeline.estimation.gauss_markov import WanderPrior, block_covariance
 from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
 from pipeline.estimation.multi_position.model import motion_at_rests
 from pipeline.estimation.noise import wander_prior
-from pipeline.estimation.rest_means import readings_in, rests_of
+from pipeline.estimation.rest_means import Rests, readings_in, rests_of
 from pipeline.estimation.table_errors import type_b
 from pipeline.estimation.uncertainty_budget import (
     GRAVITY,
@@ -68,11 +70,7 @@ from pipeline.physics.effects import effect_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from pipeline.core.records import Index, Noise, UnitRecordings
     from pipeline.core.settings import DataSheet, Method, Settings
-    from pipeline.estimation.engine import ResidualNoise
-    from pipeline.estimation.gauss_markov import WanderPrior
-    from pipeline.estimation.rest_means import Rests
     from pipeline.estimation.turns import TurnPart
 
 

@@ -27,13 +27,12 @@ import numpy as np
 
 from imu_logs.units import DEGREES, TRIADS
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.records import AXES
+from pipeline.core.records import AXES, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from imu_logs.log import Log
-    from pipeline.core.records import Values
     from pipeline.core.settings import Sensor
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from imu_logs.clocks import bursts_error, rounded_error
 from imu_logs.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TABLE_CHANNELS, TRIADS
 from pipeline.core.errors import IngestError
-from pipeline.core.records import SENSOR_UNITS, median
+from pipeline.core.records import SENSOR_UNITS, Index, Integers, Mask, Note, median
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from imu_logs.log import Log
     from imu_logs.profile import Checks
-    from pipeline.core.records import Index, Integers, Mask, Note
     from pipeline.core.settings import Sensor
 
 GAP, CLIPPED, STUCK = np.uint16(1), np.uint16(2), np.uint16(4)  # bits of ``Recording.flags``

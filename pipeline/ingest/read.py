@@ -27,15 +27,18 @@ import numpy as np
 
 import imu_logs
 from imu_logs.files import is_message_log
-from imu_logs.profile import TIME, checks_of, csv_formats
+from imu_logs.profile import TIME, Checks, CsvFormat, checks_of, csv_formats
 from imu_logs.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
-from pipeline.core.errors import IngestError, MissingInputError, shortened
+from pipeline.core.errors import IngestError, InputError, MissingInputError, shortened
 from pipeline.core.records import (
     BETWEEN_ATTITUDES_S,
     NOISE_OF_ROWS,
     SENSORS,
+    Integers,
+    Mask,
     Note,
     Recording,
+    Values,
     files_of_readings,
     rate_of_attitude,
 )
@@ -50,9 +53,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from imu_logs.log import Log
-    from imu_logs.profile import Checks, CsvFormat
-    from pipeline.core.errors import InputError
-    from pipeline.core.records import Integers, Mask, Values
     from pipeline.core.settings import Ingest, Procedure, RecordingFile, Sensor
 
 

@@ -18,13 +18,14 @@ The file ``calibrations/<unit>.json`` may have been edited, truncated, or writte
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, Self
+from typing import Any, NamedTuple, NoReturn, Self
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from imu_logs.files import not_regular
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError
@@ -59,19 +60,13 @@ from pipeline.physics.measurement import (
     ExponentialRegression,
     LogEnd,
     SensorEffects,
+    Truths,
     fields_used,
     log_motion,
     sensor_effects,
     solve,
     without_effects,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from pipeline.physics.measurement import Truths
 
 # Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
 # (2 to 32 g), 32 between those of a gyroscope (125 to 4000 deg/s), 57 for rad/s, 1000 for mg and mdps.

@@ -37,8 +37,8 @@ import scipy
 import yaml
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.records import AXES, SENSORS, Recording, continuous
-from pipeline.core.settings import ProgramRest, Repeated
+from pipeline.core.records import AXES, SENSORS, Recording, Values, continuous
+from pipeline.core.settings import ProgramRest, ProgramTurn, Repeated, Sensor, Table
 from pipeline.ingest.arrow import write_recording
 from pipeline.ingest.files import COLUMNS, SHEET
 from pipeline.physics.kinematics import earth_of
@@ -46,13 +46,25 @@ from pipeline.simulation.description import (
     BY_FILE,
     BY_PROGRAM,
     ONE_RECORDING,
+    Course,
+    Description,
+    UnitDescription,
     course_of,
     plan,
     read_option,
     shipped_settings,
 )
-from pipeline.simulation.sensor import Scene, alter, bias_wander, decimals_of, drawn_effects, drawn_sensors
-from pipeline.simulation.trajectory import CommandedTurns, Gimbals, RestsAndMoves, random_errors, rotation_by
+from pipeline.simulation.sensor import (
+    Hidden,
+    Scene,
+    SimulatedSensor,
+    alter,
+    bias_wander,
+    decimals_of,
+    drawn_effects,
+    drawn_sensors,
+)
+from pipeline.simulation.trajectory import CommandedTurns, Gimbals, Planned, RestsAndMoves, random_errors, rotation_by
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -60,12 +72,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.core.records import Values
-    from pipeline.core.settings import ProgramTurn, Sensor, Table
     from pipeline.ingest.commanded_motion import Program
-    from pipeline.simulation.description import Course, Description, UnitDescription
-    from pipeline.simulation.sensor import Hidden, SimulatedSensor
-    from pipeline.simulation.trajectory import Planned
 
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")

@@ -40,7 +40,7 @@ from pydantic.dataclasses import dataclass
 from imu_logs.yaml_file import read_yaml
 from pipeline.core.errors import ConfigurationError, MissingInputError
 from pipeline.core.files import CONFIGS
-from pipeline.core.records import AXES
+from pipeline.core.records import AXES, Values
 from pipeline.core.settings import SECTIONS, Settings, completed
 from pipeline.ingest.commanded_motion import Program
 from pipeline.ingest.files import wrong_name
@@ -65,8 +65,6 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
-
-    from pipeline.core.records import Values
 
 
 ONE_RECORDING, FERRARIS = "one_recording", "ferraris"

@@ -11,8 +11,7 @@ import pytest
 from unit_settings import ingest_of
 
 from pipeline.app.commands.apply import main
-from pipeline.app.field_logs.compensate import compensate_log
-from pipeline.app.field_logs.stream import LogProfile
+from pipeline.app.field_logs.stream import LogProfile, compensate_log
 from pipeline.core.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
 from pipeline.core.records import Coefficient, FittedEffect, SensorCalibration
 from pipeline.physics.compensation import load

@@ -18,8 +18,7 @@ from unit_settings import ingest_of
 
 from imu_logs.mcap_write import DEFINITIONS, IMU, TEMPERATURE
 from pipeline.app.commands.apply import main
-from pipeline.app.field_logs.compensate import compensate_log
-from pipeline.app.field_logs.stream import LogProfile
+from pipeline.app.field_logs.stream import LogProfile, compensate_log
 from pipeline.core.errors import InputError
 from pipeline.core.records import SENSORS, Coefficient, FittedEffect, Recording, SensorCalibration
 from pipeline.estimation.noise_identification import identify_noise

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from imu_logs.files import MESSAGE_FORMATS
 from pipeline.app.commands import parser_of
-from pipeline.app.field_logs.compensate import compensate_log, require_apart
-from pipeline.app.field_logs.stream import LogProfile
+from pipeline.app.field_logs.stream import LogProfile, compensate_log, require_apart
 from pipeline.app.run_progress import Countdown
 from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.files import CONFIGS

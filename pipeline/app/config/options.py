@@ -26,12 +26,11 @@ from imu_logs.units import SENSORS
 from imu_logs.yaml_file import MAX_YAML_BYTES, read_yaml
 from pipeline.core.errors import ConfigurationError, PipelineError
 from pipeline.core.files import CONFIGS
-from pipeline.core.settings import OF_BENCH, RunSettings, UserEffectFiles
+from pipeline.core.settings import OF_BENCH, RunSettings, Sensor, Settings, UserEffectFiles
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from pipeline.core.settings import Sensor, Settings
     from pipeline.physics.effects.base import Effect
 
 

@@ -22,14 +22,12 @@ import numpy as np
 
 from imu_logs.units import FORCE_UNITS
 from pipeline.core.errors import InputError
-from pipeline.core.records import SENSORS
+from pipeline.core.records import SENSORS, Mask, Values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     import pyarrow as pa
-
-    from pipeline.core.records import Mask, Values
 
 
 DECIMALS = 12  # in the output of ``apply``: far below the resolution of sensors, above the rounding of a double

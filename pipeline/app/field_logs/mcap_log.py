@@ -13,13 +13,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Channel, McapRecord, Metadata, Schema
 
 from imu_logs.clocks import counted
-from imu_logs.mcap_file import McapReader
+from imu_logs.mcap_file import ChannelMessages, McapReader
 from imu_logs.mcap_write import DEFINITIONS, IMU, TEMPERATURE, McapCopy, new_imu, replaced
-from imu_logs.message_decoder import MAPPED, Topics, listed_topics, topic_of
-from imu_logs.profile import mcap_format
+from imu_logs.message_decoder import MAPPED, TopicDecoder, Topics, listed_topics, topic_of
+from imu_logs.profile import McapFormat, mcap_format
 from imu_logs.units import ACCELEROMETER, GYROSCOPE, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.core.errors import IngestError, InputError
 from pipeline.physics.measurement import ExponentialRegression
@@ -27,11 +27,6 @@ from pipeline.physics.measurement import ExponentialRegression
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mcap.records import McapRecord
-
-    from imu_logs.mcap_file import ChannelMessages
-    from imu_logs.message_decoder import TopicDecoder
-    from imu_logs.profile import McapFormat
     from pipeline.app.field_logs.stream import LogProfile, LogStream, Output, Result
     from pipeline.core.records import Integers, Values
 

@@ -38,14 +38,14 @@ from imu_logs.units import DEGREES, TRIADS
 from pipeline.app.profile_detection.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.checks.bench import other_axes
 from pipeline.core.errors import IngestError, shortened
-from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Recording, median
-from pipeline.core.settings import RecordingFile
+from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Note, Recording, median
+from pipeline.core.settings import Ingest, RecordingFile, Sensor, Settings
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
-from pipeline.ingest.axis_maps import FAILS_DEG, FITS_DEG, misfit_deg, moves_of, rests_of
+from pipeline.ingest.axis_maps import FAILS_DEG, FITS_DEG, MoveByHand, misfit_deg, moves_of, rests_of
 from pipeline.ingest.files import FILE, grouped, parts_of
 from pipeline.ingest.quality_flags import CLIPPED, GAP, REST_LIMITS, STUCK, equal_share
 from pipeline.ingest.read import read_attitudes, read_table, to_recording
-from pipeline.physics.signal.rests import SHORTEST_REST_S, find_rests, rests_from_table, runs
+from pipeline.physics.signal.rests import SHORTEST_REST_S, Rest, find_rests, rests_from_table, runs
 from pipeline.physics.signal.segments import MAX_AXIS_SINE, turns_by_hand
 from pipeline.simulation.description import shipped_settings
 
@@ -56,10 +56,6 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
     from imu_logs.log import Values
-    from pipeline.core.records import Note
-    from pipeline.core.settings import Ingest, Sensor, Settings
-    from pipeline.ingest.axis_maps import MoveByHand
-    from pipeline.physics.signal.rests import Rest
 
 
 MAX_SEARCHED_SAMPLES = 500_000  # searched for rests and moves

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from imu_logs import proposal
-from imu_logs.columns import LOW_COST_ERROR, NO_SENSOR, OFFSETS, stated_unit, whole, words_of
+from imu_logs.columns import LOW_COST_ERROR, NO_SENSOR, OFFSETS, Columns, UnknownLog, stated_unit, whole, words_of
 from imu_logs.guesses import (
     ASSUMED_HZ,
     CENTIDEGREES,
@@ -38,7 +38,6 @@ from pipeline.ingest.axis_maps import MoveByHand, interval_of, misfit_deg, moves
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from imu_logs.columns import Columns, UnknownLog
     from imu_logs.proposal import Proposal
     from pipeline.core.records import Values
     from pipeline.core.settings import Sensor

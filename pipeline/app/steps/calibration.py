@@ -34,10 +34,12 @@ from pipeline.core.records import (
     AXES,
     SCHEMA_VERSION,
     SENSORS,
+    Fit,
     NotCalibrated,
     Recording,
     SensorCalibration,
     Validation,
+    Values,
     calibrated,
     coverage_factor,
 )
@@ -53,7 +55,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.app.steps.batch import Job
-    from pipeline.core.records import Fit, Recording, Values
     from pipeline.core.settings import Board, DataSheet, Settings
 
 

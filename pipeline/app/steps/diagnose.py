@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.app.steps.unit_files import StoredUnit
 from pipeline.core.errors import omission
-from pipeline.core.records import SCHEMA_VERSION, SensorDiagnosis, Validation, calibrated
+from pipeline.core.records import (
+    SCHEMA_VERSION,
+    Fit,
+    Noise,
+    SensorCalibration,
+    SensorDiagnosis,
+    UnitRecordings,
+    Validation,
+    calibrated,
+)
 from pipeline.estimation.known_effects import without_known_effects
 from pipeline.estimation.noise import required_noises
 from pipeline.evaluation.diagnosis.diagnose import diagnose, effective_noise, without_diagnosis
@@ -17,7 +26,6 @@ if TYPE_CHECKING:
 
     from pipeline.app.steps.batch import Job
     from pipeline.core.pack import Files
-    from pipeline.core.records import Fit, Noise, SensorCalibration, UnitRecordings
     from pipeline.core.settings import Settings
 
 

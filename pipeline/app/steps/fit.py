@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.checks.reference_scale import rate_error
 from pipeline.core.errors import CannotCalibrateError
-from pipeline.core.records import NotCalibrated
+from pipeline.core.records import Fit, NotCalibrated, UnitRecordings
 from pipeline.estimation.stages import GIVEN, fit_stage
 from pipeline.estimation.stated_lines import with_stated
 
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.app.steps.batch import Job
-    from pipeline.core.records import Fit, UnitRecordings
     from pipeline.core.settings import Settings
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.core.errors import PipelineError
-from pipeline.core.settings import Stated
+from pipeline.core.settings import Sensor, Settings, Stated
 from pipeline.ingest.files import digests_of_entries
 from pipeline.output.history import unit_state
 from pipeline.output.pages.pages import failure_page
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from pipeline.app.steps.batch import Job
     from pipeline.core.files import JSON
     from pipeline.core.pack import Files, Pack
-    from pipeline.core.settings import Sensor, Settings
 
 KEPT = ("schema_version", "sensor", "table", "procedure", "method", "config_sha256", "software")
 

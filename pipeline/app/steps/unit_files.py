@@ -6,8 +6,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.core.pack import INCOMPLETE_SUFFIX, Pack
-from pipeline.core.records import SENSORS, Noise, UnitRecordings, Validation, fit_from_json
+from pipeline.core.pack import INCOMPLETE_SUFFIX, Files, Pack
+from pipeline.core.records import SENSORS, Fit, Noise, Recording, UnitRecordings, Validation, fit_from_json
 from pipeline.ingest.arrow import from_parquet, to_parquet
 from pipeline.unit import UnitFiles
 
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from pipeline.app.steps.batch import Job
-    from pipeline.core.pack import Files
-    from pipeline.core.records import Fit, Recording
 
 
 def recordings_of(packs: Mapping[str, Pack], unit: str) -> list[Recording]:

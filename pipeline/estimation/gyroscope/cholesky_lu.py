@@ -42,7 +42,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -71,12 +71,12 @@ from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative, lin
 from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
-from pipeline.estimation.multi_position.faces_and_turns import across_axis, turns_of
+from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, across_axis, turns_of
 from pipeline.estimation.multi_position.gyroscope import between_recordings
 from pipeline.estimation.multi_position.moves import trapezoids
 from pipeline.estimation.multi_position.result import NOT_INCLUDED
 from pipeline.estimation.reference_least_squares import of_channels
-from pipeline.estimation.rest_means import rests_of
+from pipeline.estimation.rest_means import Rests, rests_of
 from pipeline.estimation.stages import FitStage, StageInput
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, used_motions
@@ -89,12 +89,6 @@ from pipeline.estimation.uncertainty_budget import (
     stage_parameters,
 )
 from pipeline.physics.signal.rests import runs
-
-if TYPE_CHECKING:
-    from pipeline.core.records import UnitRecordings, Values
-    from pipeline.core.settings import Settings
-    from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand
-    from pipeline.estimation.rest_means import Rests
 
 NAME = "cholesky_lu"
 FIT_STAGES = {

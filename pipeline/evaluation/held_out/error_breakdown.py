@@ -57,6 +57,7 @@ from pipeline.core.records import (
     MATRIX_ROWS,
     FittedEffect,
     Motion,
+    Noise,
     SensorCalibration,
     StepErrors,
     Values,
@@ -75,7 +76,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     Corrected = tuple[Values, Values, Values | None]  # vector, magnitude, truth
-    from pipeline.core.records import Noise, SensorCalibration, Values
     from pipeline.core.settings import Settings, Table
 
 

@@ -12,7 +12,7 @@ import pytest
 import scipy
 
 import pipeline
-from pipeline.app.field_logs.compensate import compensate_log
+from pipeline.app.field_logs.stream import compensate_log
 from pipeline.core.errors import InputError, NotObservableError
 from pipeline.core.records import SensorCalibration
 from pipeline.physics.compensation import load
