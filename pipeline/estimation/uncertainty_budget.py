@@ -215,7 +215,7 @@ def gain_of(model: Model, fitted: FitByHand, place: Values) -> Values:
     """
     equations = model.equations(fitted.state)
     n, scale = len(equations.residual), max(fitted.hypotheses, key=lambda hypothesis: hypothesis[1])[2]
-    white, _ = equations.whitened(fitted.noise, np.column_stack([equations.columns, np.eye(n)]))
+    white, _ = equations.whitened(fitted.noise, np.column_stack([equations.columns, np.eye(n)]), scale)
     X, root = white[:, :-n], white[:, -n:]
     inverse = scaled_inverse(X.T @ X + scale * np.diag(fitted.precision))
     return np.asarray((place @ inverse @ X.T @ root)[BASE], np.float64)

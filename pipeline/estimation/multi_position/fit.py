@@ -2,8 +2,9 @@
 
     step = (N + k P)^-1 (X^T C^-1 r - k P p),    covariance = k (N + k P)^-1,   N = X^T C^-1 X
 
-The step is taken under the most likely hypothesis of the noise; the covariance is averaged over the hypotheses by their
-restricted likelihood (``pipeline.estimation.engine``),
+where k does not scale the limits of the sensor file in r: their rows of ``C^-1/2`` are multiplied by ``sqrt(k)``, as
+the prior P is. The step is taken under the most likely hypothesis of the noise; the covariance is averaged over the
+hypotheses by their restricted likelihood (``pipeline.estimation.engine``),
 
     -2 log L_R = rss / k + nu log k + log det C + log det(N + k P),    k = max(1, rss / nu),   nu = n - p
 
@@ -372,7 +373,7 @@ def fit(
         prior = _prior(model, state, limits)
         likeliest = int(np.argmax(scores))
         solved = solve(equations, hypotheses[likeliest], *prior)
-        same = not np.any(prior[0]) or abs(solved.scale - scale) <= SAME_SCALE * scale
+        same = not (np.any(prior[0]) or equations.stated) or abs(solved.scale - scale) <= SAME_SCALE * scale
         if (likeliest == best and same) or rounds > MAX_GAUSS_NEWTON_ITERATIONS // 2:
             break
         best, scale = likeliest, solved.scale
@@ -414,7 +415,7 @@ def _descended(  # noqa: PLR0917  (what an iteration is)
             after = _prior(model, moved, limits)
             then = solve(further, noise, *after)
             both = np.stack([equations.residual, further.residual * further.error / equations.error], axis=1)
-            squares = np.sum(equations.whitened(noise, both)[0] ** 2, axis=0)
+            squares = np.sum(equations.whitened(noise, both, solved.scale)[0] ** 2, axis=0)
             squares += solved.scale * np.array([weight @ values**2 for weight, values in (prior, after)])
             shorter = np.max(np.abs(then.step) / _uncertainty(then, small)) < np.max(np.abs(solved.step) / uncertainty)
             if last or shorter or (rounds <= FAR_ROUNDS and squares[1] < squares[0]):
@@ -515,6 +516,8 @@ def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, value
     rank, rss = int(kept.sum()), max(float(r @ r - shown @ shown), 0.0)
     spare = max(n - rank, 1)
     k, k_free = (max(1.0, rss / n), max(1.0, rss / spare)) if noise.free_scale else (1.0, 1.0)
+    white[n - equations.stated :] *= np.sqrt(k_free)
+    gram = (X / size).T @ (X / size) if equations.stated else gram
     w, V = np.linalg.eigh(gram + np.diag(k_free * precision / size**2))
     kept = w > 1e-14 * w[-1]
     half = V[:, kept] / np.sqrt(w[kept]) / size[:, None]

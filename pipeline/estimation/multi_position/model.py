@@ -14,7 +14,7 @@ D   : (n, n) covariance by errors of the direction of gravity at each rest, as l
 H   : (n, 3 t) derivatives with respect to the bias of each axis in each of t stretches of time, over its white noise
 R   : (t, t) covariance of a Gauss-Markov bias of unit variance, averaged over each stretch
 q   : standard deviation of that bias over white noise
-k   : at least 1: scatter beyond the hypotheses of a grid (``fit``)
+k   : at least 1: scatter beyond the hypotheses of a grid (``fit``), of all equations but those of limits
 
 A parameter that the recordings do not determine has a separate equation, a pseudo-observation of the value of an ideal
 sensor with the standard uncertainty u by the sensor file's limit. ``between`` is the standard
@@ -140,6 +140,7 @@ class Equations:
     common: Values | None = None
     direction: Values | None = None
     frame: Values | None = None  # (n, 3); F
+    stated: int = 0  # number of the last equations, which are pseudo-observations of limits
     _kernels: dict[float, Values] = field(default_factory=dict, compare=False, repr=False)
 
     @property
@@ -165,13 +166,15 @@ class Equations:
             C += noise.bias.ratio**2 * self._kernels[noise.bias.time]
         return C
 
-    def whitened(self, noise: NoiseHypothesis, values: Values) -> tuple[Values, float]:
-        """Return ``L^-1`` times (n, p) values, where ``L L^T = C``, and log det C."""
+    def whitened(self, noise: NoiseHypothesis, values: Values, k: float = 1.0) -> tuple[Values, float]:
+        """Return ``L^-1`` times (n, p) values, where ``L L^T = C``, those of limits times sqrt(k), and log det C."""
         L, log_determinant = self.factor(noise)
         if L.ndim == 1:
-            return values / L[:, None], log_determinant
-        solved, failed = scipy.linalg.lapack.dtrtrs(L, values, lower=1)
-        assert failed == 0  # noqa: S101
+            solved = values / L[:, None]
+        else:
+            solved, failed = scipy.linalg.lapack.dtrtrs(L, values, lower=1)
+            assert failed == 0  # noqa: S101
+        solved[len(solved) - self.stated :] *= np.sqrt(k)
         return solved, log_determinant
 
     def factor(self, noise: NoiseHypothesis) -> tuple[Values, float]:
@@ -183,6 +186,12 @@ class Equations:
         if failed:
             L = cholesky(self.covariance(noise))
         return L, 2.0 * float(np.sum(np.log(np.diag(L))))
+
+    def scaled(self, noise: NoiseHypothesis, k: float) -> Values:
+        """Return the covariance of the residuals, ``k C`` but for the errors of limits: (n, n) array."""
+        L = cholesky(self.covariance(noise))
+        L[:, : len(L) - self.stated] *= np.sqrt(k)
+        return np.asarray(L @ L.T)
 
     def ceilings(self, hypotheses: Sequence[NoiseHypothesis]) -> Values:
         """Return the largest log L that a model can have under each hypothesis, with no residual: (t,) array."""
@@ -206,6 +215,7 @@ class EquationBlock:
     frame: Values | None = None  # (n, 3); F; None: zeros
     shared: Values | None = None  # (n, 12); change of moves by errors of the accelerometer's calibration
     force: Values | None = None  # (n, m, 3); change of moves by the specific force at each rest, per g
+    stated: bool = False  # whether they are pseudo-observations of limits; the last block
 
 
 def stacked(
@@ -258,6 +268,7 @@ def stacked(
         common=common,
         direction=diagonal([block.direction for block in blocks]),
         frame=frame,
+        stated=sizes[-1] if blocks[-1].stated else 0,
     )
 
 
@@ -353,4 +364,5 @@ def limit_block(known: Mapping[str, float], columns: Values, state: State, unit:
         columns / u[:, None],
         lambda term: np.zeros((len(u), len(term.values))),
         unit * u,
+        stated=True,
     )

@@ -174,7 +174,8 @@ def limits_contribution(model: Model, fitted: FitByHand) -> tuple[list[Contribut
         return [], np.zeros((len(place), len(place)))
     equations = fitted.equations
     X = equations.columns
-    inverse = np.linalg.inv(equations.covariance(fitted.noise))
+    scale = max(fitted.hypotheses, key=lambda hypothesis: hypothesis[1])[2]
+    inverse = np.linalg.inv(equations.scaled(fitted.noise, scale))
     gain = scaled_inverse(X.T @ inverse @ X) @ X.T @ inverse
     of_limits = gain[:, -len(model.known_by_limit) :]  # their pseudo-observations are the last equations
     if equations.frame is not None:
@@ -193,7 +194,7 @@ def _with_monte_carlo(
     X, H = np.concatenate([equations.columns, prior]), np.zeros((n + len(prior), p, p))
     H[:n] = curvature(model, fitted)
     covariances = [
-        scipy.linalg.block_diag(scale * equations.covariance(noise), np.eye(len(prior)))
+        scipy.linalg.block_diag(equations.scaled(noise, scale), np.eye(len(prior)))
         for noise, _, scale in fitted.hypotheses
     ]
     solvers = [quadratic_results(X, H, np.asarray(np.linalg.pinv(c, hermitian=True), float)) for c in covariances]
