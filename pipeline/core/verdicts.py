@@ -238,6 +238,13 @@ def moves_over_noise(validation: Mapping[str, Any]) -> float | None:
     return found["mean_deg"]["after"] / floor if floor else None
 
 
+def turn_errors(validation: Mapping[str, Any]) -> dict[str, float]:
+    """Return the rms error of the angle of a sheet's held-out turns, deg, before and after; empty without them."""
+    turns = validation.get("turns") or ()
+    squares = {name: [(t["angle_deg"][name] - t["stated_deg"]) ** 2 for t in turns] for name in ("before", "after")}
+    return {name: (sum(each) / len(turns)) ** 0.5 for name, each in squares.items()} if turns else {}
+
+
 def _far_after_moves(row: Mapping[str, Any], sensor: str) -> str:
     """Return the angle after held-out moves by hand in words if a unit is marked for it; else an empty text."""
     over = _number(row.get(f"{sensor}_moves_over_noise")) or 0.0

@@ -26,6 +26,7 @@ from pipeline.core.verdicts import (
     error_of,
     moves_over_noise,
     problems,
+    turn_errors,
 )
 from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.evaluation.held_out.attitude import NO_HAND
@@ -233,6 +234,7 @@ def explain(
     text: str = template("explain.txt").render(
         far=MARK_ABOVE_FLOORS,
         far_after_moves=MARK_AFTER_MOVES,
+        turn_errors=turn_errors,
         units=[*units, *({"name": unit, "failure": failure} for unit, failure in failures.items())],
     )
     return "\n".join([*_wrapped(text.splitlines(), width), ""])

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pipeline.core.records import Fit, SensorValidation, UnitRecordings, Validation, calibrated
 from pipeline.core.settings import Settings
 from pipeline.estimation.noise import required_noises
-from pipeline.evaluation.held_out.attitude import attitude, gravity_direction, turn_departures
+from pipeline.evaluation.held_out.attitude import attitude, gravity_direction, held_out_turns
 from pipeline.evaluation.held_out.samples import OTHER_SENSOR
 from pipeline.evaluation.held_out.validation import validate
 
@@ -21,7 +21,7 @@ def validate_unit(unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit]
         held_out_errors(recordings, fits, settings),
         attitude(found["accelerometer"], found["gyroscope"], filtered),
         gravity_direction(**found, recordings=filtered, noise=noise, procedure=settings.procedure),
-        turn_departures(**found, recordings=filtered, noise=noise, procedure=settings.procedure),
+        *held_out_turns(**found, recordings=filtered, noise=noise, procedure=settings.procedure),
     )
 
 

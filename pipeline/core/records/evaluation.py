@@ -164,6 +164,7 @@ class Validation:
     sensors: Mapping[str, SensorValidation | None]  # None for a sensor without a calibration
     attitude: dict[str, Any]  # see ``pipeline.evaluation.held_out.attitude``
     gravity_direction: dict[str, Any]
+    turns: Sequence[Mapping[str, Any]] = ()  # held-out turns of a sheet
     turn_departures: tuple[str, ...] = ()  # held-out turns whose stated angle the calibrated gyroscope contradicts
 
     @property
@@ -185,6 +186,7 @@ class Validation:
             **{sensor: part and part.to_json() for sensor, part in self.sensors.items()},
             "attitude": self.attitude,
             "gravity_direction": self.gravity_direction,
+            **({"turns": list(self.turns)} if self.turns else {}),
             **({"turn_departures": list(self.turn_departures)} if self.turn_departures else {}),
         }
 
@@ -193,7 +195,7 @@ class Validation:
         """Return the object from the value of ``to_json``."""
         parts = {sensor: data[sensor] and SensorValidation.from_json(data[sensor]) for sensor in SENSORS}
         departures = tuple(data.get("turn_departures", ()))
-        return cls(data["unit"], parts, data["attitude"], data["gravity_direction"], departures)
+        return cls(data["unit"], parts, data["attitude"], data["gravity_direction"], data.get("turns", ()), departures)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ gravity and the observed one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -41,7 +41,7 @@ from pipeline.core.records import (
 from pipeline.core.settings import Procedure
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.multi_position.accelerometer import white_of
-from pipeline.estimation.multi_position.faces_and_turns import turns_of
+from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, turns_of
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.moves import moves_of, observed_rests
@@ -219,8 +219,7 @@ def gravity_direction(
     ``largest_expected_rms_deg`` (by noise and uncertainties, exceeded with a probability of 0.5 %; where the fit
     determines the matrix), of fewer than ``FEWEST_MOVES`` ``over_expected`` (the errors weighted by their covariance,
     with the scatter of a steady hand, over what they exceed with this probability) and ``creeping_rests`` (number of
-    rests in which the unit turned slowly). Where the procedure states turns, ``turns``: ``recording, time_s, axis,
-    stated_deg`` and ``angle_deg`` (``before`` and ``after``).
+    rests in which the unit turned slowly). Where the procedure states turns without a sheet, ``turns`` (``TurnAngle``).
     """
     if not is_multi_position("gyroscope", recordings):
         return {"reason": NO_HAND}
@@ -232,7 +231,9 @@ def gravity_direction(
         return {"reason": "no rest is held out"}
     rests, gravity = observed
     judged = replace(rests, held_out=~rests.held_out)
-    turns = turns_of(recordings, judged, accelerometer, procedure, role if role == HELD_OUT else "")
+    whole, turns = role if role == HELD_OUT else "", None
+    if procedure.sheet is None:
+        turns = turns_of(recordings, judged, accelerometer, procedure, whole)
     model = GyroscopeModel(judged, moves_of(recordings, judged), gravity, noise, fewest=1, turns=turns)
     if model.moves is None:
         return {"reason": "no move is held out"}
@@ -254,44 +255,54 @@ def gravity_direction(
             steady = min(moves, STEADY_HAND), min(directions, STEADY_HAND)
             found["over_expected"] = model.weighted_direction_error(*of_fit, steady, ratio)
     if turns:
-        found["turns"] = [
-            {**vars(after), "angle_deg": {"before": before.angle_deg, "after": after.angle_deg}}
-            for before, after in zip(*map(turns.described, states.values()), strict=True)
-        ]
+        found["turns"] = _turns(turns, states)
     return found
 
 
-def turn_departures(
+def _turns(turns: TurnsByHand, states: Mapping[str, State]) -> list[dict[str, Any]]:
+    """Return the turns with the angle by each state, ``before`` and ``after`` the calibration."""
+    return [
+        {**vars(each[0]), "angle_deg": {name: t.angle_deg for name, t in zip(states, each, strict=True)}}
+        for each in zip(*map(turns.described, states.values()), strict=True)
+    ]
+
+
+def held_out_turns(
     accelerometer: SensorCalibration | None,
     gyroscope: SensorCalibration | None,
     recordings: Sequence[Recording],
     noise: Noise | None,
     procedure: Procedure,
-) -> tuple[str, ...]:
-    """Describe the held-out turns of a sheet whose stated angle the calibrated gyroscope contradicts.
+) -> tuple[list[dict[str, Any]], tuple[str, ...]]:
+    """Return the held-out turns of a sheet, and descriptions of those whose angle the calibrated gyroscope contradicts.
 
-    The angle is that of the calibrated rate. Its variance has noise, the stated accuracy, the calibration's
-    uncertainty, the bias wander, and, as a bias that differs between files, the mean of the held-out rests less the
-    bias.
+    A turn has ``recording, time_s, axis, stated_deg, angle_deg`` (``before`` and ``after`` the calibration, by the
+    integrated rate) and ``standard_uncertainty_deg`` of its error. That has noise, the stated accuracy, the
+    calibration's uncertainty, the bias wander, and, as a bias that differs between files, the mean of the held-out
+    rests less the bias. Without held-out rests that of the fit's rests stands for it.
     """
     if gyroscope is None or procedure.sheet is None or not is_multi_position("gyroscope", recordings):
-        return ()
+        return [], ()
     rests = rests_of("gyroscope", recordings, procedure, None, HELD_OUT)
+    rests = rests or rests_of("gyroscope", recordings, procedure)
     if rests is None:
-        return ()
+        return [], ()
     turns = turns_of(
         recordings, replace(rests, held_out=np.zeros(len(rests.time), bool)), accelerometer, procedure, HELD_OUT
     )
     if turns is None:
-        return ()
-    block = turns.equations(_state(gyroscope), white_of(rests, noise))
+        return [], ()
+    states = {"before": State(np.zeros(3), np.eye(3)), "after": _state(gyroscope)}
+    block = turns.equations(states["after"], white_of(rests, noise))
     J = block.base * block.error[:, None]
     between = np.average(rests.reading, axis=0, weights=rests.count) - gyroscope.bias
     wander = np.zeros(3) if noise is None else noise.wander
     variance = block.error**2 + np.einsum("rp,pq,rq->r", J, gyroscope.parameters.covariance[BASE, BASE], J)
     deviation = np.sqrt(variance + J[:, BIAS] ** 2 @ (between**2 + wander**2))
     deviation[len(turns.name) :] = np.inf  # the axes refer to the case, of whose angles to the frame nothing is known
-    return tuple(turns.departures(block.residual * block.error, deviation))
+    pairs = zip(_turns(turns, states), deviation.tolist(), strict=False)
+    departures = turns.departures(block.residual * block.error, deviation)
+    return [turn | {"standard_uncertainty_deg": u} for turn, u in pairs], tuple(departures)
 
 
 def _state(calibration: SensorCalibration) -> State:

@@ -20,6 +20,7 @@ from pipeline.core.verdicts import (
     error_of,
     kinds_of,
     moves_over_noise,
+    turn_errors,
 )
 from pipeline.output.outcome import apply_command, as_overrides, commands_of, found_mountings, place, run_command
 from pipeline.output.pages.chart import ChartLayer, Figure, LineMark, Panel, chart
@@ -120,6 +121,7 @@ def render(
         attitude=attitude if attitude.get("curve") else None,
         attitude_figure=attitude_over_time(attitude),
         moves=moves if moves.get("moves") else None,
+        turns=validation.get("turns"),
         recordings=recording_rows(recordings, rests),
         segments=segments(recordings, rests, calibration),
         rests=rest_rows(calibration),
@@ -195,6 +197,7 @@ def _sensor(
         "kind": "warn" if not held_out.get("held_out", True) else "" if (far or likely) and kind == "good" else kind,
         "of_rests": table.motion == "none" and not logged,
         "moves": {**validation["gravity_direction"], "over_noise": moves} if moves else None,
+        "turned": turn_errors(validation) if sensor == "gyroscope" else None,
         "far": far,
         "commands": commands_of(found, sensor, str(calibration.get("unit")), run)
         if (run := settings.stated.run)

@@ -401,6 +401,19 @@ def test_hysteresis_does_not_move_the_mean_of_a_soak(tmp_path: Path) -> None:
     assert "failed" not in calibrated(tmp_path).diagnosis["accelerometer"]  # as rests without a temperature made it
 
 
+def test_held_out_turns_without_rests_state_their_angle(tmp_path: Path) -> None:
+    unit, x = with_three_turns(tmp_path), np.eye(3)[0]
+    unit.write("other", "turn,x,360,3,yes", *turned(361.5, 90.0, x, np.eye(3)[2]), "g", between=0.0)
+    unit.sheet()
+    found = calibrated(tmp_path)
+    (turn,) = found.validation["turns"]
+    assert (turn["recording"], turn["axis"], turn["stated_deg"]) == ("other", "x", 360.0)
+    assert abs(turn["angle_deg"]["after"] - 361.5) < 4.0 < abs(turn["angle_deg"]["before"] - 361.5)
+    assert 3.0 < turn["standard_uncertainty_deg"] < 6.0
+    found.report(tmp_path / "page.html")
+    assert "of the angle of 1 held-out turn" in (tmp_path / "page.html").read_text()
+
+
 @pytest.mark.parametrize("cycles", [1, 2])
 def test_a_drift_is_told_from_hysteresis_by_a_second_cycle(tmp_path: Path, cycles: int) -> None:
     rng, n = np.random.default_rng(5), 5400
