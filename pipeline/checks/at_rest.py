@@ -44,7 +44,7 @@ from pipeline.physics.signal.rests import RATE_AT_REST, RATE_AT_REST_DPS, rests_
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.core.records import Mask, Recording, Values
+    from pipeline.core.records import Integers, Mask, Recording, Values
     from pipeline.core.settings import DataSheet, Sensor, Settings
 
 
@@ -116,7 +116,7 @@ def _doubted(
         if reading is None or not len(rests) or not len(blocks := _blocks(recording, reading)):
             continue
         step = _digit(reading)
-        static, usual = median(_moments(blocks)), median(rests)
+        static, usual = median(_moments(blocks.reshape(-1, 3), np.full(*blocks.shape[:2]))), median(rests)
         louder = float(np.max(static[0] / np.maximum(usual[0], step)))
         quieter = float(np.min(usual[1] / np.maximum(static[1], step)))
         if louder > MAX_TIMES_RESTS * faster:
@@ -260,9 +260,12 @@ def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
         ends = np.append(np.flatnonzero((np.diff(rows) > 1) | stepped) + 1, len(rows))
         starts = np.append(0, ends[:-1])
         long = np.flatnonzero(ends - starts >= MIN_SAMPLES_OF_REST)
-        for k, sensor in itertools.product(long[:: len(long) // MIN_RESTS_OF_SCATTER + 1], SENSORS):
+        if not (long := long[:: len(long) // MIN_RESTS_OF_SCATTER + 1]).size:
+            continue
+        rows = np.concatenate([rows[starts[k] : ends[k]] for k in long])
+        for sensor in SENSORS:
             if (reading := recording.reading(sensor)) is not None:
-                moments[sensor].append(_moments(reading[None, rows[starts[k] : ends[k]]]))
+                moments[sensor].append(_moments(reading[rows], (ends - starts)[long]))
     return {sensor: np.concatenate(parts) for sensor, parts in moments.items()}
 
 
@@ -273,21 +276,24 @@ def _rests_by_hand(recordings: Sequence[Recording], sensor: str) -> Values:
         reading = recording.reading(sensor) if recording.role == "rests" else None
         if reading is None or len(blocks := _blocks(recording, reading)) < 10:
             continue
-        scatter, white, _ = np.percentile(_moments(blocks), 10.0, axis=0)
+        scatter, white, _ = np.percentile(_moments(blocks.reshape(-1, 3), np.full(*blocks.shape[:2])), 10.0, axis=0)
         found.append(np.stack([scatter, white, np.full(3, np.nan)])[None])
     return np.concatenate(found)
 
 
-def _moments(blocks: Values) -> Values:
-    """Return scatter, white noise and mean of (k, n, 3) blocks: (k, 3, 3) array.
+def _moments(values: Values, sizes: Integers) -> Values:
+    """Return scatter, white noise and mean of the parts with k numbers of samples of (n, 3) values: (k, 3, 3) array.
 
     The white noise by successive differences does not include slow changes (J. von Neumann, Annals of Mathematical
     Statistics 12 (1941), 367-395).
     """
-    white = np.sqrt(np.mean(np.diff(blocks, axis=1) ** 2, axis=1) / 2.0)
-    mean = blocks.mean(axis=1)
-    scatter = np.sqrt(np.sum((blocks - mean[:, None]) ** 2, axis=1) / (blocks.shape[1] - 1))
-    return np.stack([scatter, white, mean], axis=1)
+    starts, size = np.cumsum(sizes) - sizes, sizes[:, None]
+    mean = np.add.reduceat(values, starts) / size
+    change = np.diff(values, axis=0, append=values[-1:])
+    change[starts + sizes - 1] = 0.0  # to the next part
+    squares = np.hstack([(values - np.repeat(mean, sizes, axis=0)) ** 2, 0.5 * change**2])
+    spread = np.sqrt(np.add.reduceat(squares, starts) / (size - 1))
+    return np.stack([spread[:, :3], spread[:, 3:], mean], axis=1)
 
 
 def check_axes(recordings: Sequence[Recording]) -> None:

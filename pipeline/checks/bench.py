@@ -46,7 +46,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -355,6 +355,7 @@ def other_axes(moves: Sequence[MoveByHand]) -> tuple[str, Values | None] | None:
     return text, permutations[counts.index(fewest)] if counts.count(fewest) == 1 else None
 
 
+@cache
 def signed_permutations() -> list[Values]:
     """Return the 48 maps of axes onto signed axes: (3, 3) arrays."""
     return [

@@ -109,9 +109,8 @@ class Channel:
 
 
 def quantiles(values: Values, *shares: float) -> Values:
-    """Return quantiles without interpolation, in a tenth of the time of ``numpy.quantile``."""
-    places = [round(share * (len(values) - 1)) for share in shares]
-    return np.asarray(np.partition(values, places, axis=0)[places])
+    """Return quantiles without interpolation; numpy partitions the many equal values of a table's log slowly."""
+    return np.asarray(np.sort(values, axis=0)[[round(share * (len(values) - 1)) for share in shares]])
 
 
 @once_of_log
@@ -218,8 +217,7 @@ def ratio_quantiles(one: Values, other: Values, cut: int, least: float, *shares:
 
 def largest_but(size: Values, cut: int) -> float:
     """Return the value that a share ``1 / cut`` of all values reaches."""
-    place = max(len(size) // cut, 1)
-    return float(np.partition(size, -place)[-place])
+    return float(np.sort(size)[-max(len(size) // cut, 1)])
 
 
 def axis_index(recording: Recording) -> int:
