@@ -16,7 +16,7 @@ where b, p, n, s are (3,) and M is (3, 3).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
@@ -43,8 +43,6 @@ from pipeline.core.records.budget import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from numpy.typing import NDArray
 
     from imu_logs.log import Mask, Values

@@ -43,10 +43,11 @@ readings of the log by fixed point, and effects of timing shift the logged rate.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
-from typing import TYPE_CHECKING
+from typing import TypeAlias
 
 import numpy as np
 
@@ -63,6 +64,7 @@ from pipeline.core.records import (
     Values,
     corrected,
 )
+from pipeline.core.settings import Settings, Table
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, STATED_WIDTH, block_covariance
 from pipeline.estimation.selection import INFLATED
 from pipeline.estimation.uncertainty_budget import DITHERED, covariance_without_reference
@@ -72,11 +74,7 @@ from pipeline.physics.effects.base import truth
 from pipeline.physics.effects.mounting import SEPARATOR, Mounting
 from pipeline.physics.measurement import LogEnd, SensorEffects, fields_used, inverse_of, linear_truth, log_motion, solve
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    Corrected = tuple[Values, Values, Values | None]  # vector, magnitude, truth
-    from pipeline.core.settings import Settings, Table
+Corrected: TypeAlias = "tuple[Values, Values, Values | None]"  # vector, magnitude, truth
 
 
 SPLINE_DEGREE = 3  # of the spline through a rate: 40 deg/s that change in 5 s are followed to 1e-4 deg/s at 0.12 s

@@ -8,26 +8,21 @@ bias, error of a scale factor, or cross-axis sensitivity. Which are beyond the l
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from pipeline.core.files import JSON
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Values
-from pipeline.core.verdicts import FAR, KINDS, MARK_ABOVE_FLOORS, Verdict, far_by_moves, problems, state_of
+from pipeline.core.verdicts import FAR, KINDS, MARK_ABOVE_FLOORS, RowState, Verdict, far_by_moves, problems, state_of
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.outcome import all_well, beyond_limits_groups, command_of, counts_of, explain_command, ratio_words
 from pipeline.output.pages.chart import Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
 from pipeline.output.pages.fleet import parameter_table, wide
 from pipeline.output.pages.pages import Scale, number, percent, scale_of, script_data, template, typeset, unit_text
 from pipeline.output.pages.parameters import SUMMARY_COLUMNS
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
-
-    from pipeline.core.files import JSON
-    from pipeline.core.verdicts import RowState
-
 
 UnitChart = tuple[Figure, dict[str, list[str]]]  # a chart of units, and the text of each dot by its colour
 FIRST_ROWS = 100  # rows in the page; the script adds the others when they come into view

@@ -29,11 +29,13 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.core.files import JSON
 from pipeline.core.records import (
     BASE_COUNT,
     BIAS,
@@ -61,12 +63,6 @@ from pipeline.output.pages.pages import MARK, number, template
 from pipeline.output.pages.parameters import fitted_parameters
 from pipeline.physics.effects import owner_of
 from pipeline.physics.effects.base import Owner
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from pipeline.core.files import JSON
-
 
 KIND = np.array([0, 0, 0, 1, 2, 2, 2, 1, 2, 2, 2, 1])  # of bias, diagonal and other elements of the matrix
 STATED_ACCURACIES = "stated accuracies of the bench"

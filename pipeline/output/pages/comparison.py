@@ -34,27 +34,21 @@ Sources: B. L. Welch, Biometrika 34 (1947) 28-35 (degrees of freedom); S. Holm, 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
+from pipeline.core.files import JSON
 from pipeline.core.records import BASE, BIAS, SENSOR_UNITS, SENSORS, matrix_of
-from pipeline.core.verdicts import error_of
+from pipeline.core.verdicts import Error, error_of
 from pipeline.output.pages.chart import Figure
 from pipeline.output.pages.group_charts import COLOURS, Point, bars, curves
 from pipeline.output.pages.pages import measured, number
 from pipeline.output.pages.parameters import fitted_parameters
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from pipeline.core.files import JSON
-    from pipeline.core.verdicts import Error
 
 TEST_LEVEL = 0.05  # of a test, and 1 minus the coverage of an interval (JCGM 100:2008, 6.2.2: about 95 %)
 MEASURES = {"after": "rms error, held out", "truth": "rms error against the truth"}

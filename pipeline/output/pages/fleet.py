@@ -30,15 +30,19 @@ from __future__ import annotations
 
 import io
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from pipeline.core.files import JSON, spreadsheet_cell, write_atomically
-from pipeline.core.records import MEDIAN_SIZE, SENSOR_UNITS, SENSORS
+from pipeline.core.records import MEDIAN_SIZE, SENSOR_UNITS, SENSORS, Mask, Values
+from pipeline.core.verdicts import Error
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.history import difference, dropped, errors_of, of_units
 from pipeline.output.outcome import add_command, uncertainty_words
@@ -47,17 +51,7 @@ from pipeline.output.pages.group_charts import Point, bars
 from pipeline.output.pages.pages import LINK_MARK, MARK, number, template
 from pipeline.output.pages.parameters import PARAMETER_KEYS, SUMMARY_COLUMNS
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from pipeline.core.files import JSON
-    from pipeline.core.records import Mask, Values
-    from pipeline.core.verdicts import Error
-
-    Texts = NDArray[np.object_]
+Texts = NDArray[np.object_]
 
 
 # units, below which a median absolute deviation is too uncertain: its standard deviation is 17 % of it

@@ -7,9 +7,9 @@ levels (the noise floor) are lines across all rows. A row with an interval is th
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,9 +28,6 @@ from pipeline.output.pages.chart import (
     text,
 )
 from pipeline.output.pages.pages import number
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 ROW, LEFT, RIGHT, HALF_TICK = 30, 6, 64, 14  # px; half of a tick's text
 BRACKET = 48  # px, width of a bracket

@@ -10,12 +10,14 @@ one-sided, ``N = noise_density / sqrt(2)``. Source: IEEE Std 952-1997, annex C.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.files import JSON
 from pipeline.core.records import AXES, SENSOR_UNITS, SENSORS, Noise, Recording, SensorCalibration, Values
+from pipeline.core.settings import DataSheet, Table
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S
 from pipeline.estimation.noise_terms import TERM_UNITS, allan_variance
 from pipeline.evaluation.diagnosis.words import plain
@@ -34,15 +36,7 @@ from pipeline.output.pages.chart import (
     sentences,
 )
 from pipeline.output.pages.group_charts import Point, bars
-from pipeline.output.pages.pages import number, percent
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.core.files import JSON
-    from pipeline.core.settings import DataSheet, Table
-    from pipeline.output.pages.pages import Scale
-
+from pipeline.output.pages.pages import Scale, number, percent
 
 # held-out errors of diagnosis and validation that agree within this factor are shown as one series
 EQUAL_ERROR_FACTOR = 1.2

@@ -9,26 +9,22 @@ import json
 import math
 import re
 from collections import deque
+from collections.abc import Container, Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from html import escape
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from jinja2 import FileSystemLoader, Template, select_autoescape
 from markupsafe import Markup
 
 from pipeline.core.compiled_templates import Templates
+from pipeline.core.files import JSON
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import is_fixed
 from pipeline.evaluation.diagnosis.words import plain
-
-if TYPE_CHECKING:
-    from collections.abc import Container, Iterable, Mapping, Sequence
-
-    from pipeline.core.files import JSON
-
 
 MARK, LINK_MARK = "<!-- history -->", "<!-- history link -->"  # in templates/unit.html
 NOTHING = "\N{EN DASH}"

@@ -15,11 +15,13 @@ In a row of the tables, the columns of every campaign (``SUMMARY_COLUMNS``) come
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import chain
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.core.files import JSON
 from pipeline.core.records import (
     AFTER_BASE,
     AXES,
@@ -31,17 +33,12 @@ from pipeline.core.records import (
     SENSORS,
     standard_uncertainty,
 )
+from pipeline.core.settings import DataSheet, Sensor
 from pipeline.core.verdicts import Verdict, error_of, moves_over_noise
 from pipeline.estimation.candidates import is_fixed
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.pages.held_out_section import first_and_last_step, passes
 from pipeline.physics.statements import beyond_uncertainty, both_figures, left_out, limited_effects, without_rotation
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.core.files import JSON
-    from pipeline.core.settings import DataSheet, Sensor
 
 UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
 SENSOR_COLUMNS = (

@@ -22,13 +22,14 @@ another shape. All points are the binned data of the diagnosis: nothing is fitte
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.errors import shortened
+from pipeline.core.files import JSON
 from pipeline.core.records import (
     AXES,
     MEDIAN_SIZE,
@@ -40,6 +41,7 @@ from pipeline.core.records import (
     SensorCalibration,
     Values,
 )
+from pipeline.core.settings import DataSheet, Table
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW, min_delta_bic
 from pipeline.estimation.posterior import prior_limit
 from pipeline.evaluation.diagnosis.words import plain
@@ -63,13 +65,6 @@ from pipeline.physics.kinematics import table_motion
 from pipeline.physics.measurement import predicted_reading
 from pipeline.physics.signal.encoder_rate import rate_by_angle
 from pipeline.physics.signal.filters import filtered
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from pipeline.core.files import JSON
-    from pipeline.core.settings import DataSheet, Table
-
 
 RESIDUAL_BINS = 36  # of a covariate, and of a turn: 10 deg each
 MIN_BIN_SAMPLES = 5  # samples of a bin, below which it counts as empty: its scatter is unknown

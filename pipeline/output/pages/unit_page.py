@@ -5,12 +5,13 @@ One file that works offline: style, script and charts are inline, and its conten
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from pipeline.core.files import JSON, json_text
 from pipeline.core.records import AXES, BIAS, MATRIX, SENSOR_UNITS, SENSORS, Recording, SensorCalibration, Values
+from pipeline.core.settings import Settings
 from pipeline.core.verdicts import (
     KINDS,
     MARK_ABOVE_FLOORS,
@@ -50,11 +51,6 @@ from pipeline.output.pages.residual_section import (
 )
 from pipeline.physics.signal.rests import Rest, rests_from_table
 from pipeline.physics.statements import beyond_uncertainty, beyond_words, frame_words, left_out, sentences
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.settings import Settings
 
 LEFT, LANE, LETTERS = 86, 17, 13  # px of the names, px of a lane, letters of a name
 USES = {"used": 1, "held out": 2, "left out": 0}  # of the rests that a fit found in the readings, with their colours
