@@ -14,7 +14,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import StageInput
-from pipeline.physics.signal.quiet_motion import creep_of_readings, posterior_creep_rates
+from pipeline.physics.signal.quiet_motion import before_slow_motion, creep_of_readings, posterior_creep_rates
 from pipeline.physics.signal.rests import Rest, find_rests
 from tests.published import validate
 
@@ -132,3 +132,12 @@ def test_a_lone_turn_about_the_vertical_has_a_rest_at_either_end() -> None:
     assert [r.accepted for r in found] == [True, True]
     assert found[0].stop == pytest.approx(still, abs=25)
     assert found[1].start == pytest.approx(still + turning, abs=25)
+
+
+def test_the_slow_begin_of_a_turn_is_no_rest() -> None:
+    """A turn of 35 s begins with 0.1 to 1.5 deg/s from 0.5 to 2.1 s; a rest there moved a bias by 0.35 deg/s."""
+    rng, time = np.random.default_rng(0), np.arange(3500) / 100.0
+    noise = 0.035 * rng.normal(size=(len(time), 3))
+    turn = np.outer(720.0 / 35.0 * (1.0 - np.cos(2.0 * np.pi * time / 35.0)), [0.0, 0.0, 1.0])
+    assert before_slow_motion(noise + turn, [(50, 210)], 0.01, 100) == []
+    assert before_slow_motion(noise, [(50, 210)], 0.01, 100) == [(50, 210)]

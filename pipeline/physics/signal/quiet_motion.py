@@ -56,6 +56,7 @@ FEWEST_OF_A_SLOPE = 8  # samples from which a slope has five degrees of freedom
 QUIET_WINDOW_S, MIN_WINDOW_SAMPLES = 0.2, 3  # shorter than a move; samples that have a variance
 SIGNIFICANT_TURN = 6.0  # q above
 NEIGHBOUR_STRETCHES = 5  # stretches: their median withstands two that turned
+LINE_BLOCKS = 5  # of a third of a rest: noise alone passes q in 6e-9, a tremor that differs from block to block in 3 %
 RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests differ by g-sensitivity and creep
 # Of a window's mean, whatever the tremor of the stretch. The rests of a published MPU-6050 recording in a hand reach
 # 1.7 except at the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
@@ -205,7 +206,8 @@ def before_slow_motion(rate: Values, pieces: Spans, interval: float, shortest: i
     """Cut the rests of a recording of one turn where the turn begins or ends slowly.
 
     A rest ends where a window differs by q standard deviations from the third of the rest that is farthest from the
-    turn. ``quiet_pieces`` takes such motion for a tremor: a turn of 26 s that begins smoothly loses 3 deg by it.
+    turn. ``quiet_pieces`` takes such motion for a tremor: a turn of 26 s that begins smoothly loses 3 deg by it. Where
+    blocks of that third follow a line to its end, by q of its standard uncertainties, the piece is no rest.
     """
     size, out = max(MIN_WINDOW_SAMPLES, round(QUIET_WINDOW_S / interval)), []
     for start, stop in pieces:
@@ -215,6 +217,8 @@ def before_slow_motion(rate: Values, pieces: Spans, interval: float, shortest: i
         if len(part) > far:
             off = np.abs(mean - median(mean[:far]))
             steps = np.abs(np.diff(part[:far], axis=0))
+            if _follows_a_line(part[:far], noise_of_steps(steps)):
+                continue
             noise = np.maximum(noise_of_steps(steps) / np.sqrt(size), MEDIAN_SIZE * median(off[:far]))
             limit = np.maximum(SIGNIFICANT_TURN * noise, counts_of(steps) * (1.0 + DECIMAL_ROUNDING))
             turns = np.flatnonzero(np.any(off > limit, axis=1))
@@ -222,6 +226,17 @@ def before_slow_motion(rate: Values, pieces: Spans, interval: float, shortest: i
             part = part[:kept]
         out.append((start, start + len(part)) if before else (stop - len(part), stop))
     return out
+
+
+def _follows_a_line(rate: Values, white: Values) -> bool:
+    """Return whether the means of blocks of a rate, (n, 3), follow a line; ``white``: (3,), noise of a sample."""
+    size = len(rate) // LINE_BLOCKS
+    mean = rate[: LINE_BLOCKS * size].reshape(LINE_BLOCKS, size, 3).mean(axis=1)
+    x = np.arange(LINE_BLOCKS) - 0.5 * (LINE_BLOCKS - 1)
+    slope = x @ mean / (x @ x)
+    left = mean - mean.mean(axis=0) - np.outer(x, slope)
+    noise = np.maximum(np.sqrt(np.sum(left**2, axis=0) / (LINE_BLOCKS - 2)), white / np.sqrt(size))
+    return bool(np.any(np.abs(slope) > SIGNIFICANT_TURN * noise / np.sqrt(x @ x)))
 
 
 def counts_of(differences: Values) -> Values:
