@@ -74,6 +74,16 @@ def report_of(unit: Unit, stated: dict[str, Any], **table: Any) -> dict[str, Any
     return certificate(unit.calibration, unit.validation, settings_of(unit, stated, **table), "25.0 to 29.0")
 
 
+def test_a_report_states_full_scale_sample_rates_and_filter(unit: Unit) -> None:
+    calibration = {**unit.calibration, "inputs": [{"rate_hz": rate} for rate in (100.0, 8.333333, None, 50.0)]}
+    report = certificate(calibration, unit.validation, settings_of(unit, STATED), None)
+    for result, full_scale in zip(report["measurementResults"], ("full scale, g", "full scale, deg/s"), strict=True):
+        conditions = result["influenceConditions"]
+        assert conditions[full_scale] == unit.settings.sensor.of(result["name"]).full_scale
+        assert conditions["sample rate, Hz"] == "8.33 to 100"
+        assert conditions["filter before the fit"] == unit.settings.filter.name
+
+
 def test_a_report_of_which_nothing_is_stated_is_no_certificate_and_claims_no_traceability(unit: Unit) -> None:
     report = report_of(unit, {"name": "blank"})
     assert not report["complete"]

@@ -120,7 +120,7 @@ def test_add_names_the_files_whose_error_changes() -> None:
     error = was.held_out_errors(less=False)["accelerometer", "px4.params"]
     assert now.held_out_errors(less=True)["accelerometer", "px4.params"] == pytest.approx(error, rel=0.05)
     (line,) = [line for line in changed_files("U", was, now) if "px4.params" in line]
-    assert line.startswith("U, accelerometer: these files cannot hold it, and their error stays: ")
+    assert line.startswith("U, accelerometer: these files cannot hold the effect, and their error stays: ")
     assert not changed_files("U", now, now)
     for held in now.validation["accelerometer"]["reduced"]:
         if held["part"] == "diagonal":

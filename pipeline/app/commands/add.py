@@ -365,7 +365,8 @@ def changed_files(unit: str, before: ExportedUnit | None, after: ExportedUnit | 
         if abs(now / error - 1.0) > SMALLEST_CHANGE_OF_A_FILE:
             files.setdefault(f"{change} {error:.3g} -> {now:.3g} {SENSOR_UNITS[sensor]}", []).append(file)
         elif best[1][sensor] < (1.0 - SMALLEST_CHANGE_OF_A_FILE) * best[0][sensor]:
-            files.setdefault(f"{unit}, {sensor}: these files cannot hold it, and their error stays", []).append(file)
+            stays = f"{unit}, {sensor}: these files cannot hold the effect, and their error stays"
+            files.setdefault(stays, []).append(file)
     return [f"{change}: {', '.join(names)}" for change, names in files.items()]
 
 

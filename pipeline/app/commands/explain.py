@@ -28,7 +28,7 @@ from pipeline.core.verdicts import (
     problems,
     turn_errors,
 )
-from pipeline.evaluation.diagnosis.words import in_words
+from pipeline.evaluation.diagnosis.words import in_words, listed
 from pipeline.evaluation.held_out.attitude import NO_HAND
 from pipeline.output.exports.reading import counts_of, explain_board, explain_calibration, read_any
 from pipeline.output.history import read_history
@@ -246,11 +246,11 @@ def _notes(calibration: JSON) -> list[str]:
     notes = [line for s, part in parts.items() for line in sentences(s, part)]
     beyond = {s: beyond_words(part) for s, part in parts.items()}
     notes += [f"{s.capitalize()}, outside the data sheet's limits: {names}." for s, names in beyond.items() if names]
-    notes += [
-        f"U of the {s} does not include {source}: {reason}."
-        for s, part in parts.items()
-        for source, reason in beyond_uncertainty(part)
-    ]
+    outside: dict[tuple[str, str], list[str]] = {}  # both sensors together where source and reason are the same
+    for s, part in parts.items():
+        for each in beyond_uncertainty(part):
+            outside.setdefault(each, []).append(f"the {s}")
+    notes += [f"U of {listed(of)} does not include {what}: {why}." for (what, why), of in outside.items()]
     lacks: list[dict[str, str | None]] = [
         {s: frame_words(part) for s, part in parts.items()},
         {s: part.get("not_determined") for s, part in parts.items()},

@@ -43,8 +43,8 @@ UNSTEADY = (
     "the residual is above the noise and does not depend on any recorded quantity"
 )
 PLUS_MINUS = (
-    "+- is two standard uncertainties by the noise of these recordings, as the selection estimates it. A calibration "
-    "with the effect estimates the noise anew, adds the accuracies of the bench, and states coverage factors for 95 %."
+    "+- is two standard uncertainties by the noise of these recordings; U of a calibration with the effect adds the "
+    "accuracies of the bench."
 )
 
 

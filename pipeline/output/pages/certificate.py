@@ -169,6 +169,7 @@ def _administrative(calibration: JSON, stated: Certificate, row: JSON) -> JSON:
 def _result(sensor: str, calibration: JSON, held_out: JSON, settings: Settings, temperature: str | None) -> JSON:
     part, stated, table = calibration[sensor], settings.certificate, settings.table
     first, last = first_and_last_step(held_out)
+    rates = sorted({number(row["rate_hz"]) for row in calibration.get("inputs") or [] if row.get("rate_hz")}, key=float)
     return {
         "name": sensor,
         "unit": part["unit"],
@@ -190,6 +191,9 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: Settings, 
             },
         ],
         "influenceConditions": {
+            f"full scale, {part['unit']}": settings.sensor.of(sensor).full_scale,
+            "sample rate, Hz": " to ".join([*rates[:1], *rates[1:][-1:]]) or None,
+            "filter before the fit": settings.filter.name,
             "temperature of the sensor, degC": temperature,
             "local gravity, g": table.gravity_g,
             "accuracy of local gravity, g": table.gravity_accuracy_g,
