@@ -57,6 +57,7 @@ from pipeline.core.records import (
     Contribution,
     Estimate,
     FittedEffect,
+    Motion,
     NoiseParts,
     NotIncluded,
     SensorCalibration,
@@ -68,29 +69,24 @@ from pipeline.core.records import (
 )
 from pipeline.estimation.candidates import TILT, limits_of, tilt_like_zeros
 from pipeline.estimation.design import EffectColumns, columns_of_samples, joined_motions
-from pipeline.estimation.engine import scaled_inverse
+from pipeline.estimation.engine import LinearMap, ResidualNoise, scaled_inverse
 from pipeline.estimation.monte_carlo import through, with_trials
 from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
-from pipeline.estimation.multi_position.model import motion_at_rests
+from pipeline.estimation.multi_position.model import Model, motion_at_rests
 from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 from pipeline.estimation.turns import RowGroups
 from pipeline.physics.effects import catalogue, effect
-from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Layout, Owner
+from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Effect, Layout, Owner
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from numpy.typing import ArrayLike
 
-    from pipeline.core.records import Motion, SensorCalibration, Values
     from pipeline.core.settings import DataSheet, Settings, Table
-    from pipeline.estimation.engine import LinearMap, ResidualNoise
     from pipeline.estimation.gauss_markov import WanderPrior
     from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
-    from pipeline.estimation.multi_position.model import Model
-    from pipeline.estimation.table_errors import Reference
-    from pipeline.physics.effects.base import Effect
 
 
 OWNERS = (Owner.SENSOR, Owner.RECORDING)  # errors of place, table and timing have lines of their own in the budget

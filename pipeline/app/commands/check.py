@@ -14,14 +14,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from imu_logs.files import SUFFIXES
 from imu_logs.guesses import TO_DECIDE
-from imu_logs.proposal import as_yaml, layouts_of, not_found
+from imu_logs.proposal import Proposal, as_yaml, layouts_of, not_found
 from pipeline.app.commands import parser_of
 from pipeline.app.commands.readings import Reading, campaign_of, config_of_log, recordings_of_files
-from pipeline.app.config.campaign import find_campaign, load_campaign
+from pipeline.app.config.campaign import Campaign, find_campaign, load_campaign
 from pipeline.app.config.options import nearest
 from pipeline.app.one_unit import try_unit, unit_of_campaign
 from pipeline.app.profile_detection.recording_facts import (
     SUITS_FERRARIS,
+    Line,
     as_text,
     counted,
     facts,
@@ -36,11 +37,11 @@ from pipeline.app.profile_detection.unit_guesses import propose
 from pipeline.app.run_progress import Countdown
 from pipeline.core.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, shortened
 from pipeline.core.files import CONFIGS, write_atomically
-from pipeline.core.records import SENSORS
-from pipeline.core.settings import Ingest, settings_of_ranges
+from pipeline.core.records import SENSORS, Recording
+from pipeline.core.settings import Ingest, Sensor, settings_of_ranges
 from pipeline.estimation.rest_means import BY_HAND
 from pipeline.ingest.files import FILE, grouped, recording_files
-from pipeline.output.outcome import NAMED_PER_LINE, as_overrides, found_mountings
+from pipeline.output.outcome import NAMED_PER_LINE, FoundMounting, Ways, as_overrides, found_mountings
 from pipeline.physics.statements import LEFT_OUT_REASONS
 from pipeline.simulation.description import read_option
 
@@ -49,12 +50,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from imu_logs.columns import UnknownLog
-    from imu_logs.proposal import Proposal
-    from pipeline.app.config.campaign import Campaign
-    from pipeline.app.profile_detection.recording_facts import Line
-    from pipeline.core.records import Recording
-    from pipeline.core.settings import Sensor
-    from pipeline.output.outcome import FoundMounting, Ways
 
 MOST_IN_FULL = 3  # logs of one layout
 WIDTH = 118  # characters of a line

@@ -16,6 +16,7 @@ from pipeline.app.commands.readings import campaign_of, complete_rows, config_of
 from pipeline.app.config.campaign import load_campaign
 from pipeline.app.planning.guide import (
     MAX_PLANNED_RESTS,
+    GuideProgress,
     ProposedTurn,
     default_goal,
     fitted_by_hand,
@@ -26,22 +27,18 @@ from pipeline.app.planning.guide import (
     propose,
 )
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError, PipelineError
-from pipeline.core.records import NotCalibrated
-from pipeline.core.settings import RecordingFile
+from pipeline.core.records import NotCalibrated, Recording, Values
+from pipeline.core.settings import RecordingFile, Settings
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.ingest.files import grouped, recording_files
 from pipeline.ingest.read import read_table, to_recording
-from pipeline.physics.signal.rests import WINDOW_S, find_rests
+from pipeline.physics.signal.rests import WINDOW_S, Rest, find_rests
 from pipeline.unit import Task, UnitFiles, UnitState, run_steps
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
-    from pipeline.app.planning.guide import GuideProgress
-    from pipeline.core.records import Recording, Values
-    from pipeline.core.settings import Settings
-    from pipeline.physics.signal.rests import Rest
 
 POLL_S = 1.0  # between two readings of a growing log: short against a rest
 STILL_RESTING_S = 1.0  # from the end of a rest to that of the log, below which the rest may continue

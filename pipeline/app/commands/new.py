@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pipeline.app.commands import parser_of
+from pipeline.app.config.options import GROUPS
 from pipeline.app.planning.plan import readme
 from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.files import CONFIGS
@@ -17,7 +18,6 @@ from pipeline.output.outcome import run_command
 from pipeline.output.pages.pages import template
 from pipeline.simulation.description import TABLE_PROCEDURES, UnitDescription, described, read_option, shipped_settings
 
-GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"
 EPILOG = """\
 On a terminal the command asks for the sensor, the ranges, the procedure and the table that no option states.

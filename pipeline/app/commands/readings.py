@@ -16,7 +16,7 @@ from pipeline.app.config.options import SettingProblem, nearest
 from pipeline.checks.checks import check_recordings
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
-from pipeline.core.settings import RecordingFile, Settings
+from pipeline.core.settings import Ingest, RecordingFile, Sensor, Settings
 from pipeline.ingest.files import candidate_files
 from pipeline.ingest.read import read_table, to_recording
 from pipeline.simulation.description import shipped_settings
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from pipeline.app.config.campaign import Campaign
     from pipeline.core.records import Recording
-    from pipeline.core.settings import Ingest, Sensor
 
 DEFAULT_PROFILE = "canonical_csv"
 SEARCHED_FOLDERS = 4  # from the folder of the log upwards: a campaign is above raw/<unit>/
