@@ -30,6 +30,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
 SHIPPED = _PACKAGE / "shipped" if INSTALLED else _PACKAGE.parent  # holds Snakefile, workflow, configs, data
 CONFIGS = SHIPPED / "configs"
+EFFECTS_FOLDER = CONFIGS / "effect"
 # First characters by which spreadsheets take a text as a formula, or split it (OWASP, CSV injection). With ' in front,
 # the text was escaped, or begins so.
 FORMULA = re.compile(r"'*[=+\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")

@@ -36,6 +36,7 @@ import pandas as pd
 import scipy
 import yaml
 
+from imu_logs.units import SECOND_NS
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import AXES, SENSORS, Recording, Values, continuous
 from pipeline.core.settings import ProgramRest, ProgramTurn, Repeated, Sensor, Table
@@ -76,7 +77,6 @@ if TYPE_CHECKING:
 
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
-NANOSECONDS = 1_000_000_000  # in a second
 ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3  # of CSV files: rounding far below any noise
 MARGIN_S = 2.0  # by which a separate log begins earlier and ends later than the recording
 LARGEST_OFFSET_S, DRIFT_PPM = 100.0, 50.0  # of a random clock; the drift is the standard deviation of quartz clocks
@@ -174,7 +174,7 @@ def record(
     mounting, table and timing change the motion; ``pause``: s, between the recordings and before the first.
     """
     times = _times(planned, unit.interval_s, pause)
-    seconds = [t / NANOSECONDS for t in times]
+    seconds = [t / SECOND_NS for t in times]
     rng = {name: streams[name] for name in ("table", "temperature", "link", *SENSORS)}
     first = benches.get(planned[0].role, benches[""]).sensors
     wander = {s: bias_wander(seconds, first[s].data_sheet.wander_time_s, rng[s]) for s in SENSORS}
@@ -207,13 +207,13 @@ def record(
 
 def _times(planned: Sequence[Planned], interval: float, pause: float) -> list[NDArray[np.int64]]:
     """Return the sample times: whole intervals since power-on, ns."""
-    step = round(interval * NANOSECONDS)
+    step = round(interval * SECOND_NS)
     out, now = [], pause
     for recording in planned:
         first = int(np.ceil(now / interval - 1e-9))
         count = int(recording.trajectory.duration / interval + 1e-9) + 1
         out.append((first + np.arange(count, dtype=np.int64)) * step)
-        now = float(out[-1][-1]) / NANOSECONDS + pause
+        now = float(out[-1][-1]) / SECOND_NS + pause
     return out
 
 
@@ -292,7 +292,7 @@ def with_table_log(
             turn = isinstance(plans[0].trajectory, CommandedTurns)
             known = ("table_angle", "table_rate") if turn else ("table_attitude",)
             channels = {name: channels[name] for name in known}
-        time_ns = np.rint(tau * NANOSECONDS).astype(np.int64)
+        time_ns = np.rint(tau * SECOND_NS).astype(np.int64)
         logged = Recording(f"{recording.name}_table", "table", None, time_ns, **channels)
         logs.append(_wrapped(logged) if log.wrapped else logged)
     return [*(replace(r, **NO_TABLE) for r in whole), *logs], {"offset_s": offset, "drift_ppm": 1e6 * drift}
@@ -457,7 +457,7 @@ def simulate_unit(
     total = sum(p.trajectory.duration + course.pause_s for p in planned)
     pause = unit.interval_s if unit.procedure == ONE_RECORDING else course.pause_s
     times = zip(planned, _times(planned, unit.interval_s, pause), strict=True)
-    soaks = tuple((t[0] / NANOSECONDS, t[-1] / NANOSECONDS) for p, t in times if p.kind == "soak")
+    soaks = tuple((t[0] / SECOND_NS, t[-1] / SECOND_NS) for p, t in times if p.kind == "soak")
     ramp = course.thermal_ramp_degc if soaks or unit.procedure == "thermal_ramp" else 0.0
     of_ramp = {"ramp": ramp, "ramp_period": total / 1.5, "soaks": soaks}
     environment = replace(random_environment(streams["room"]), **{**of_ramp, **unit.temperature})

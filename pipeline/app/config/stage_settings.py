@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from imu_logs.units import SENSORS
 from pipeline.app.config.options import GIVEN, effects_for
-from pipeline.core.files import CONFIGS, canonical_json, state_of_files
+from pipeline.core.files import EFFECTS_FOLDER, canonical_json, state_of_files
 from pipeline.core.settings import OF_BENCH, Board, Settings, Stated, Unit
 from pipeline.core.user_cache import from_cache, to_cache
 from pipeline.ingest.files import state_of_recordings
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 PACKAGE = Path(__file__).resolve().parents[2]
 PACKAGES = ("pipeline", "imu_logs", "imu_research")  # beside each other, in a clone and in a wheel
 CAMPAIGN = "campaign"  # cannot be a batch, because their names end in a number
-EFFECTS_FOLDER = CONFIGS / "effect"  # read by pipeline.physics.effects
 # An import of the package, or of jinja2: module and names, or only a module. ``ast`` takes 0.5 s for all files.
 IMPORT = re.compile(
     r"^[ \t]*(?:from ((?:pipeline|imu_)[\w.]*|jinja2) import (\([^)]*\)|.*)|import ((?:pipeline|imu_)[\w.]*))",

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
+from imu_logs.units import SECOND_NS
 from pipeline.core.records.budget import as_json, with_arrays
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 ReturnedQuantity = TypeVar("ReturnedQuantity")
 Arguments = ParamSpec("Arguments")
 
-NANOSECONDS = 1_000_000_000
 BETWEEN_ATTITUDES_S = 1000.0  # between the blocks of a file of attitudes, whose times are not known
 NOISE_OF_ROWS = "noise_of_rows"  # in the source of means: standard deviation of each by white noise, by sensor
 CLIPPED_OR_STUCK = 0b110  # bits 1 and 2 of ``Recording.flags``
@@ -94,7 +94,7 @@ class Recording:
     @cached_property
     def time(self) -> Values:
         """Time of each sample: (n,) array, s since power-on."""
-        seconds: Values = self.time_ns // NANOSECONDS + (self.time_ns % NANOSECONDS) / NANOSECONDS
+        seconds: Values = self.time_ns // SECOND_NS + (self.time_ns % SECOND_NS) / SECOND_NS
         return seconds
 
     @cached_property
@@ -110,7 +110,7 @@ class Recording:
     @cached_property
     def interval(self) -> float:
         """Median sampling interval, s."""
-        return float(median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
+        return float(median(np.diff(self.time_ns))) / SECOND_NS if self.samples > 1 else float("nan")
 
     @cached_property
     def _quantities(self) -> Quantities:

@@ -24,14 +24,13 @@ import yaml
 from imu_logs.files import read_text
 from imu_logs.yaml_file import load_yaml
 from pipeline.core.errors import ConfigurationError, MissingInputError, PipelineError
-from pipeline.core.files import CONFIGS
+from pipeline.core.files import EFFECTS_FOLDER
 from pipeline.core.records import FittedEffect
 from pipeline.core.settings import Table, UserEffectFiles
 from pipeline.physics.effects.base import Effect
 from pipeline.physics.effects.formula_effect import FormulaEffect, fitted_anyway, read_declaration
 from pipeline.physics.effects.mounting import SETUP_EFFECTS, in_session
 
-EFFECTS_FOLDER = CONFIGS / "effect"
 BUILT_IN = re.compile(r"^built_in: true", re.MULTILINE)
 MAX_EFFECT_BYTES, MAX_EFFECT_VALUES = 16384, 1000  # of one file; the largest built-in one has 2 kB and 70 values
 OF_PYTHON = ("name", "owner", "layout", "meaning", "excitation", "experiment", "source")
