@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import scipy
 
-from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Recording, Values
+from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Recording, Values, once_of_log
 from pipeline.estimation.noise_search import (
     ONE_SIDED,
     QUANTILE,
@@ -210,6 +210,7 @@ def _source(sensor: str, recordings: Sequence[Recording], *, warm: bool) -> tupl
     return document, stretches
 
 
+@once_of_log
 def _scatter_of_intervals(recording: Recording) -> float:
     """Return the rms scatter of the sampling intervals without gaps, relative."""
     steps = np.diff(recording.time_ns) / (1e9 * recording.interval)

@@ -125,7 +125,7 @@ def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
     if not np.isfinite(raw).all():
         return excess, where
     step = np.abs(np.diff(raw, axis=0))
-    if not np.any(step > JUMP * _noise(step)):
+    if not any(np.any(s > JUMP * _noise(s)) for s in step.T[:, :, None]):  # mostly the first column of a move
         return excess, where
     motion = _Motion(recording)
     values = np.concatenate([motion.unexplained(s, r) for s, r in found], axis=1)

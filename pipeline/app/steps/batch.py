@@ -105,7 +105,7 @@ def main(stage: str, argv: Sequence[str]) -> int:
         getattr(module, f"{stage}_batch")(job)
         return 0
     edited = job.run.get("again", 0) != repetitions(job.results, _below(job, job.output))[0]
-    last = None if edited else _last_pack(job.output)
+    last = None if edited else Pack(last_output(job.output))
     with new_pack(job.output, (".parquet",) if job.run.get("packed", True) else (".parquet", ".html")) as add:
         for number, (unit, settings) in enumerate(job.units.items(), 1):
             print(f"{stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
@@ -118,7 +118,9 @@ def main(stage: str, argv: Sequence[str]) -> int:
             add(files)
             if inputs and not {unit + FAILED_SUFFIX, unit + INCOMPLETE_SUFFIX} & files.keys():
                 add({unit + INPUTS_OF: as_bytes({"sha256": inputs, "files": [*files]})})
-    _link_output(job.output)
+    last_output(job.output).unlink(missing_ok=True)
+    with suppress(OSError):  # on a disk without links, the next run computes every unit
+        last_output(job.output).hardlink_to(job.output)
     record_output(job, job.output)
     return 0
 
@@ -126,24 +128,6 @@ def main(stage: str, argv: Sequence[str]) -> int:
 def last_output(output: Path) -> Path:
     """Return the path of a link to the last output of a job; Snakemake deletes the output before it repeats the job."""
     return output.with_name(f".{output.name}.last")
-
-
-def _last_pack(output: Path) -> Pack | None:
-    """Return the last output of a job; None if there is none, or if it is damaged."""
-    try:
-        pack = Pack(last_output(output))
-        pack.names()
-    except DamagedFileError:
-        return None
-    return pack
-
-
-def _link_output(output: Path) -> None:
-    """Link the output of a job; on a disk without links, the next run computes every unit."""
-    last = last_output(output)
-    last.unlink(missing_ok=True)
-    with suppress(OSError):
-        last.hardlink_to(output)
 
 
 def forget_last_outputs(results: Path) -> None:
@@ -165,7 +149,7 @@ def _inputs_of(module: ModuleType, job: Job, unit: str, settings: Settings) -> s
 
 
 def _unchanged(last: Pack, unit: str, inputs: str) -> dict[str, bytes]:
-    """Return the files of a unit from the last run; empty if its inputs have changed."""
+    """Return the files of a unit from the last run; empty if there was none, or if its inputs have changed."""
     name = unit + INPUTS_OF
     try:
         found = last.json(name) if name in last else {}

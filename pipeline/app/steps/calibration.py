@@ -79,16 +79,12 @@ def frame_uncertainty(
     fitted = next((e.values.reshape(-1, 3) for e in calibration.effects if e.name == MOUNTING), np.zeros((0, 3)))
     if table.seat_deg is None and len(fitted) < 2:
         return None
-    count = len(fitted) or _mountings(recordings, calibration.sensor)
+    turns = {r.setup or r.name for r in recordings if r.role == calibration.sensor and r.axis is not None}
+    count = len(fitted) or max(len(turns), 1)  # mountings: setups, or recordings without one
     seats: Values = np.full(3, table.seat_deg or 0.0)
     if len(fitted) > 1:
         seats = np.maximum(seats, np.std(fitted, axis=0, ddof=1))
     return [float(u) for u in NORMAL_FACTOR * np.hypot(seats / np.sqrt(count), table.levelling_deg or 0.0)]
-
-
-def _mountings(recordings: Sequence[Recording], sensor: str) -> int:
-    """Return the number of mountings in the turns of a sensor: its setups, or recordings without one."""
-    return max(len({r.setup or r.name for r in recordings if r.role == sensor and r.axis is not None}), 1)
 
 
 def calibration_document(  # noqa: PLR0917  (what a calibration is composed of)
@@ -207,7 +203,7 @@ def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for sensor, key in (("accelerometer", "specific_force_g"), ("gyroscope", "angular_rate_dps")):
         own = [(r.reading(sensor), r.valid) for r in recordings if r.role in {sensor, "rests"}]
-        squares = [np.sum(v**2, axis=1)[valid].max() for v, valid in own if v is not None and valid.any()]
+        squares = [np.einsum("ij,ij->i", v, v)[ok].max() for v, ok in own if v is not None and ok.any()]
         found |= {key: round(float(np.sqrt(max(squares))), 6)} if squares else {}
     warm = [r for r in recordings if r.role in {*SENSORS, "rests"} and r.temperature is not None and r.samples]
     for key, chosen in (("temperature_degc", warm), ("soaked_degc", [r for r in warm if r.kind == "soak"])):
