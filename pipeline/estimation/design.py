@@ -150,9 +150,12 @@ def without_unknown_motion(observations: Observations, terms: Sequence[EffectCol
 
 
 def motions_of(part: RecordingRows, terms: Sequence[EffectColumns]) -> list[Motion]:
-    """Return the motion on which each term acts, and last the motion of the base."""
+    """Return the motion on which each term acts, and last the motion of the base.
+
+    A term with a slope by the motion of the base gets that.
+    """
     everything = true_motion(part, terms)
-    acting = [term.effect if term.effect.moves and np.any(term.values) else None for term in terms]
+    acting = [t.effect if t.effect.moves and np.any(t.values) and not t.effect.has_slope else None for t in terms]
     return [*(everything if own is None else true_motion(part, terms, own) for own in acting), everything]
 
 

@@ -13,7 +13,7 @@ that of a static recording or of the sensor file, two effects may mask each othe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -113,6 +113,7 @@ class Selection:
     steps: dict[str, Score] = field(default_factory=dict)  # of each selected effect, in order, when it was accepted
     alone: dict[str, Score] = field(default_factory=dict)  # of each candidate against the base
     fits: dict[tuple[str, ...], JointFit] = field(default_factory=dict)  # of base, configured and further effects
+    optima: dict[Hashable, JointFit] = field(default_factory=dict)  # of candidates, by all terms at the start
     refused: set[frozenset[str]] = field(default_factory=set)  # sets with a time constant that is not determined
 
     @property
@@ -179,7 +180,8 @@ class Selection:
         for i, score in enumerate(scores):
             this = effect(score.name)
             share = MOVER_SHARE if this.moves else CONSTANT_SHARE
-            if this.nonlinear and score.delta_bic > max(MIN_DELTA_BIC, share * top):
+            able = not self.names or self._able(score.name)  # alone, every candidate is reported at its optimum
+            if able and this.nonlinear and score.delta_bic > max(MIN_DELTA_BIC, share * top):
                 scores[i] = self._refined(score)
         return scores
 
@@ -190,8 +192,11 @@ class Selection:
         if this.name == DELAYS[1]:
             values = np.maximum(values, this.starts(self.observations.sensor)[0])
         terms = [*self.base.terms, *self._terms(), EffectColumns(this, values)]
-        fit = fit_terms(self.observations, terms, self.start, self.settings)
-        self.fits[*self.names, score.name] = replace(fit)  # without its design: there are many candidates
+        key = tuple(term.key for term in terms)
+        if key not in self.optima:
+            fit = fit_terms(self.observations, terms, self.start, self.settings)
+            self.optima[key] = replace(fit)  # without its design: there are many candidates
+        self.fits[*self.names, score.name] = fit = self.optima[key]
         before, _ = self.ranking.of_model(self.ranking.of_effects(self.names))
         gain = max(2.0 * (fit.log_likelihood - before), 0.0)
         values = fit.terms[-1].values
@@ -222,11 +227,15 @@ class Selection:
 
         ``partners``: indices of candidates that were in the model of the score in addition to the selected effects.
         """
-        second_delay = score.name in DELAYS and any(name in DELAYS for name in self.names)
         negative_lag = score.name == DELAYS[1] and score.values[0] <= 0
-        if second_delay or negative_lag or not self._possible(score.name, self.names):
+        if negative_lag or not self._able(score.name):
             return False
         return self._significant(score) and self._matters(score, partners)
+
+    def _able(self, name: str) -> bool:
+        """Return whether a candidate of any size may be added to the selected effects; a second delay may not."""
+        second_delay = name in DELAYS and any(selected in DELAYS for selected in self.names)
+        return not second_delay and self._possible(name, self.names)
 
     def _significant(self, score: Score) -> bool:
         """Return whether a candidate passes the gate and the selected effects do not already explain its signal."""

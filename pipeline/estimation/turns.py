@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from pipeline.core.settings import Table
 from pipeline.estimation.engine import ResidualNoise, ScaledColumns
 from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.estimation.table_errors import Reference, noise_on_table
-from pipeline.physics.kinematics import table_motion
+from pipeline.physics.kinematics import Pieces, table_motion
 from pipeline.physics.signal.rests import RATE_AT_REST_DPS, runs
 
 FIT_BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
@@ -29,7 +29,18 @@ MEAN_S = 1.0  # a mean hides no motion at rest, and keeps the readings' change w
 # Of a row in motion: the mean over it of a signal of 12 cycles a turn is 1 - (6 deg)^2 / 24 = 0.9995 of that in its
 # middle, so that it keeps 99.9 % of the information; a polynomial of the fifth order in the specific force, 0.9999.
 ROW_DEG = 0.5
+# Rows of a recording that would have more than so many: 12 cycles a turn keep 99.2 % of the information. The change of
+# the rate is twice as large: a polynomial of the third order in the rate keeps 99.3 %.
+MANY_ROWS, LONG_ROW_DEG, LONG_ROW_RATES = 2000, 1.5, 2.0
 ROW_RATE_SHARE = 1.0 / 30.0  # of the fastest rate: the ramps alone tell a nonlinearity from bias and scale factor
+# s; longest interval between samples at which means are by integrals: corners of 100 deg/s^2 in a row of four samples
+# then change its mean rate by 5e-3 deg/s at most
+FINEST_STEP_S = 2.1e-3
+ALL_SAMPLES = 3  # of a row, at which a shifted motion is computed: longer rows need three points each
+PIECED, PIECES = 64, (1 / 32, 1 / 8, 7 / 8, 31 / 32)  # samples of a row that is divided, at these shares of it
+MOVED_FIELDS = (  # of a turn that is shifted in time
+    *("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate", "level", "angle", "rate"),
+)
 MEDIAN_OF_DIFFERENCES = 0.9099  # median of (w[n+1] - w[n])^2 of white noise of variance 1: 2 times that of chi-square
 SCATTERED = 6.0  # standard deviations of a chi-square above its mean, and half its square for the tail of few samples
 MAX_BEND_DPS, MAX_BEND_SHARE = 0.05, 1e-3  # see ``reference_valid``
@@ -232,15 +243,19 @@ class RowGroups:
         """Return the motion at the rows."""
         arrays = {name: v for name, v in vars(motion).items() if isinstance(v, np.ndarray) and v.dtype != bool}
         means: dict[str, Any] = {name: self.means(v) for name, v in arrays.items()}
-        trajectory = motion.at_offset
-        return replace(
-            motion,
-            **means,
-            still=motion.still[self.kept[self.first]],
-            reference_valid=self.all(motion.reference_valid),
-            at_offset=None if trajectory is None else partial(self._at, trajectory),
-            at_lag=None if motion.at_lag is None else partial(self._at, motion.at_lag),
+        found = replace(
+            motion, **means, still=motion.still[self.kept[self.first]], reference_valid=self.all(motion.reference_valid)
         )
+        logged = motion.at_offset
+        if (
+            motion.axis is not None
+            and logged
+            and self.count.max(initial=0.0) > ALL_SAMPLES
+            and _step(motion) <= FINEST_STEP_S
+        ):
+            still = cache(lambda: logged(rows=self._pieces))  # the same integrals of the motion that is not shifted
+            return self._with_trajectory(found, motion, partial(self._mean_at, found, still))
+        return self._with_trajectory(found, motion, self._at)
 
     def _at(self, trajectory: Callable[..., Motion | None], offset: float | Values = 0.0, **lag: float) -> Motion:
         """Return the motion at the rows' samples shifted in time; ``offset``: of the rows."""
@@ -251,6 +266,58 @@ class RowGroups:
         motion = trajectory(offset=offset, **lag)
         assert motion is not None  # noqa: S101
         return self.motion(motion)
+
+    @staticmethod
+    def _with_trajectory(rows: Motion, motion: Motion, at: Callable[..., Motion]) -> Motion:
+        """Return the motion at the rows with the trajectories of a motion, seen by ``at``."""
+        offset, lag = (None if to is None else partial(at, to) for to in (motion.at_offset, motion.at_lag))
+        return replace(rows, at_offset=offset, at_lag=lag)
+
+    @cached_property
+    def _pieces(self) -> Pieces:
+        """The pieces of all rows.
+
+        A piece is a sample of a short row, a longer row, or at rest, where the motion next to the rest enters by a
+        shift, a part of a row, shorter towards its ends.
+        """
+        size = self.count.astype(int)
+        starts = np.repeat(size <= ALL_SAMPLES, size)
+        starts[self.first] = True
+        many = size > PIECED
+        starts[(self.first[many] + np.outer(PIECES, size[many]).astype(int)).ravel()] = True
+        begin = np.flatnonzero(starts)
+        samples, of_row = np.diff(np.append(begin, len(self.kept))), np.searchsorted(begin, self.first)
+        share = samples / np.repeat(self.count, np.diff(np.append(of_row, len(begin))))
+        return Pieces(self.kept[begin], self.kept[begin + samples - 1], share, of_row)
+
+    def _mean_at(
+        self,
+        here: Motion,
+        logged: Callable[[], Motion | None],
+        trajectory: Callable[..., Motion | None],
+        offset: float | Values = 0.0,
+        **lag: float,
+    ) -> Motion:
+        """Return the motion at the rows shifted in time by the integrals of a turn; ``here``: that not shifted.
+
+        The means of long rows change as the integrals do from ``logged``, those of the motion that is not shifted.
+        """
+        pieces = self._pieces
+        if isinstance(offset, np.ndarray):
+            offset = np.repeat(offset, np.diff(np.append(pieces.of_row, len(pieces.first))))
+        moved, before, found = trajectory(offset=offset, rows=pieces, **lag), logged(), {}
+        assert moved is not None  # noqa: S101
+        for name in MOVED_FIELDS:
+            values, mean = getattr(moved, name), getattr(here, name)
+            long = self.count.reshape(-1, *[1] * (mean.ndim - 1)) > ALL_SAMPLES
+            found[name] = values + np.where(long, mean - getattr(before, name), 0.0)
+        return self._with_trajectory(
+            replace(here, **found, reference_valid=moved.reference_valid), moved, partial(self._mean_at, here, logged)
+        )
+
+
+def _step(motion: Motion) -> float:
+    return float(np.ptp(motion.time)) / max(len(motion.time) - 1, 1)
 
 
 def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> RowGroups:
@@ -273,10 +340,13 @@ def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> RowGroups:
     speed = np.where(still, 0.0, np.linalg.norm(motion.angular_rate[kept], axis=1))
     turned = np.cumsum(speed * np.diff(time, append=time[-1]))  # at the end of the interval after each sample
     step = max(ROW_RATE_SHARE * float(speed.max()), RATE_AT_REST_DPS)
-    changed = (speed - speed[begin]) / step + 0.5
-    pieces = (time - time[begin]) / MEAN_S, (turned - turned[begin]) / ROW_DEG, changed
-    piece = np.floor(np.stack(pieces, axis=1) + 1e-9)
-    first = np.flatnonzero(np.concatenate([[True], ~alike | np.any(np.diff(piece, axis=0) != 0, axis=1)]))
+    for deg, times in ((ROW_DEG, 1.0), (LONG_ROW_DEG, LONG_ROW_RATES)):
+        changed = (speed - speed[begin]) / (times * step) + 0.5
+        pieces = (time - time[begin]) / MEAN_S, (turned - turned[begin]) / deg, changed
+        piece = np.floor(np.stack(pieces, axis=1) + 1e-9)
+        first = np.flatnonzero(np.concatenate([[True], ~alike | np.any(np.diff(piece, axis=0) != 0, axis=1)]))
+        if len(first) <= MANY_ROWS:
+            break
     return RowGroups(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(valid))
 
 

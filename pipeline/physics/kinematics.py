@@ -36,6 +36,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,6 +64,7 @@ GENTLE_DEG, EXACT_DEG = 1e-4, 1e-6  # smooth motion, where no bend is looked for
 MOVING_DPS = 0.02  # exceeds the rate noise of a resting table
 SAME_SHARE, SAME_DPS2 = 0.01, 0.1  # how nearly two neighbouring intervals must agree on an acceleration
 LAG_ROUNDING_DPS = 1e-11  # some hundred roundings of a rate of 400 deg/s
+LAG_GROUP = 16  # samples, through which a lag is followed one by one, in all groups at once
 PRINTED_ROUNDING = 1e-9  # relative: some roundings of a printed number
 MAX_DIFFERENT_MOVES = 10  # of a step: as many different changes are not those of equal moves
 CLEARLY_ABOVE = 4.0  # times the step of an exact log: its angles may all be even multiples
@@ -73,6 +76,15 @@ UP_AT_ZERO = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # se
 LEVEL_AT_ZERO = np.array([np.eye(3), np.eye(3), [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]])
 ABOUT = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)  # ABOUT[a] @ u = e_a x u
 NODES, WEIGHTS = np.polynomial.laguerre.laggauss(4)  # of integrals of exp(-x) u(x), for the lag of smooth signals
+
+
+class Pieces(NamedTuple):
+    """Pieces of rows of consecutive samples, over which a trajectory is averaged."""
+
+    first: Index  # (k,); first sample of each piece
+    last: Index  # (k,); last sample
+    share: Values  # (k,); of the row's samples
+    of_row: Index  # (m,); first piece of each row
 
 
 class EncoderTrajectory:
@@ -216,23 +228,71 @@ class EncoderTrajectory:
         In a stretch with the rate ``r + a x``, the output is ``r + a (x - lag) + (L - r + a lag) exp(-x / lag)``, where
         L is the output at x = 0. The time constant ``lag``, s, is above 0.
         """
-        through = np.zeros(len(self.time))
-        gain = np.zeros(len(self.time))
-        through[0] = self.rate[0]
-        everything = np.arange(len(self._step))
-        through[1:], gain[1:] = self._lag_step(everything, self._step, lag)
-        shown = through.copy()
-        for _ in range(len(shown)):  # each pass carries the output one sample further, with a weight that decays
-            following = through + gain * np.concatenate([[0.0], shown[:-1]])
-            settled = float(np.abs(following - shown).max()) <= LAG_ROUNDING_DPS
-            shown = following
-            if settled:
-                break
+        shown = self._lagged_samples(lag)
         k = self._interval(time)
         x = np.maximum(time - self.time[k], 0.0)
         through, gain = self._lag_step(k, x, lag)
         value = through + gain * shown[k]
         return value, (self._piecewise(k, x)[1] - value) / lag
+
+    def means(self, pieces: Pieces, offset: float | Values, lag: float) -> tuple[Values, ...]:
+        """Return means over rows of samples at ``time + offset``, behind a lag; ``offset``: of all or of each piece.
+
+        Returns (m,) arrays of the angle, its rate and acceleration, and its cosine and sine. The mean of a derivative
+        over a piece's time is the difference of its integral; behind a lag, the integral of the rate is ``A - lag r``.
+        Others are by Simpson's rule. A piece of one sample has its values. The result equals the mean over the samples,
+        dt apart, but for ``dt^2 / 24`` of the second derivative.
+        """
+        first, last, m = pieces.first, pieces.last, len(pieces.first)
+        t0, t1 = self.time[first], self.time[last]
+        beyond = 0.5 * (t1 - t0) / np.maximum(last - first, 1)
+        t0, t1 = t0 - beyond + offset, t1 + beyond + offset
+        points, size, one = np.concatenate([t0, 0.5 * (t0 + t1), t1]), t1 - t0, first == last
+        angle, rate, acceleration = self.at(points)
+        integral, turns, weights = angle, angle[None], np.ones(1)
+        if lag > 0.0:
+            rate, acceleration = self.lagged(points, lag)
+            integral = angle - lag * rate
+            turns, weights = np.array([self.angle_at(points - lag * node) for node in NODES]), WEIGHTS
+
+        def slope(of: Values, values: Values) -> Values:
+            return np.where(one, values[m : 2 * m], (of[2 * m :] - of[:m]) / np.where(one, 1.0, size))
+
+        def mean(values: Values) -> Values:
+            return np.asarray((values[:m] + 4.0 * values[m : 2 * m] + values[2 * m :]) / 6.0)
+
+        turns = np.radians(turns)
+        circle = mean(weights @ np.cos(turns)), mean(weights @ np.sin(turns))
+        found = mean(angle), slope(integral, rate), slope(rate, acceleration), *circle
+        return tuple(np.add.reduceat(pieces.share * values, pieces.of_row) for values in found)
+
+    def known_in(self, pieces: Pieces, offset: float | Values) -> Mask:
+        """Return in which rows of samples the trajectory is valid at all of ``time + offset``; see ``known_at``."""
+        first, last = pieces.first, pieces.last
+        lost = np.concatenate([[0], np.cumsum(~self.valid_samples)])
+        start, stop = self._interval(self.time[first] + offset), self._interval(self.time[last] + offset)
+        near = (np.asarray(offset) > -MEMORY_S) & (offset <= np.append(self._step, 0.0)[last])
+        known = np.where(near, lost[last + 1] == lost[first], lost[stop + 2] == lost[start])
+        return np.asarray(np.logical_and.reduceat(known, pieces.of_row))
+
+    def _lagged_samples(self, lag: float) -> Values:
+        """Return the output of a lag at the samples: ``y_i = v_i + g_i y_i-1``, by groups of samples."""
+        v, g = np.zeros((2, -(-len(self.time) // LAG_GROUP) * LAG_GROUP))
+        v[0] = self.rate[0]
+        inside = slice(1, len(self.time))
+        v[inside], g[inside] = self._lag_step(np.arange(len(self._step)), self._step, lag)
+        v, g = (np.ascontiguousarray(each.reshape(-1, LAG_GROUP).T) for each in (v, g))
+        for before, j in pairwise(range(LAG_GROUP)):  # g: from now on the weight of the output before the group
+            v[j] += g[j] * v[before]
+            g[j] *= g[before]
+        ends, weight, back, largest = v[-1].copy(), g[-1].copy(), 1, float(np.abs(self.rate).max())
+        while back < len(ends) and float(weight.max()) * largest > LAG_ROUNDING_DPS:  # twice as many groups each time
+            ends[back:] += weight[back:] * ends[:-back]
+            weight[back:] *= weight[:-back].copy()
+            weight[:back] = 0.0
+            back *= 2
+        v[:, 1:] += g[:, 1:] * ends[:-1]
+        return v.T.ravel()[: len(self.time)]
 
     def _lag_step(self, k: Index, x: Values, lag: float) -> tuple[Values, Values]:
         """Return the output of a lag at x into intervals: a value, and a factor on the output at x = 0."""
@@ -372,11 +432,19 @@ def _motion_of_turn(
     axis = AXES.index(recording.axis)
     home, still = level_at_zero(axis, recording.up, shaft), still_samples(time, rate)
 
-    def at(before: float | Values, lag: float = 0.0, offset: float | Values = 0.0) -> Motion:
-        """Return the motion at ``time + before + offset``, filtered by a first-order lag in s."""
+    def at(
+        before: float | Values, lag: float = 0.0, offset: float | Values = 0.0, rows: Pieces | None = None
+    ) -> Motion:
+        """Return the motion at ``time + before + offset``, filtered by a first-order lag in s.
+
+        ``rows``: over which it is averaged; time, temperature and rests are those of all samples.
+        """
         offset = before + offset
         moved = bool(np.any(offset))
-        if lag > 0.0:
+        if rows is not None:
+            angle, rate, acceleration, cosine, sine = log.means(rows, offset, lag)
+            level, known = turn_by(home, axis, cosine, -sine), log.known_in(rows, offset)
+        elif lag > 0.0:
             angle = log.angle_at(time + offset) if moved else log.angle
             rate, acceleration = log.lagged(time + offset, lag)
             past = np.radians([-log.angle_at(time + offset - lag * node) for node in NODES])
@@ -384,6 +452,8 @@ def _motion_of_turn(
         else:
             angle, rate, acceleration = log.at(time + offset) if moved else (log.angle, log.rate, log.acceleration)
             level = turn_about_axis(home, axis, -angle)
+        if rows is None:
+            known = log.known_at(time + offset) if moved else log.valid_samples
         force = gravity_g * level[:, 2, :]
         omega, alpha = np.zeros_like(force), np.zeros_like(force)
         omega[:, axis], alpha[:, axis] = rate, acceleration
@@ -402,7 +472,7 @@ def _motion_of_turn(
                 at_offset=partial(at, offset, lag),
                 at_lag=partial(at, offset),
                 level=level,
-                reference_valid=log.known_at(time + offset) if moved else log.valid_samples,
+                reference_valid=known,
             )
         )
 

@@ -11,7 +11,8 @@ from pipeline.estimation.design import Design, EffectColumns
 from pipeline.estimation.gauss_markov import WHITE_SETTING
 from pipeline.estimation.observations import Observations, observe
 from pipeline.estimation.ranking import MIN_NEW_COLUMN_SHARE, without
-from pipeline.physics.effects import catalogue
+from pipeline.physics.effects import catalogue, effect
+from pipeline.physics.kinematics import table_motion
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 
@@ -42,9 +43,14 @@ def information(observations: Observations, terms: list[EffectColumns]) -> list[
     return found
 
 
+@pytest.mark.parametrize("many", [turns.MANY_ROWS, 0])
 @pytest.mark.parametrize("sensor", ["accelerometer", "gyroscope"])
-def test_no_effect_loses_more_than_a_hundredth_of_its_information(sensor: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_effect_loses_more_than_a_hundredth_of_its_information(
+    sensor: str, many: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(turns, "MANY_ROWS", many)
     rows = observed(sensor, 0.004)
+    monkeypatch.setattr(turns, "MANY_ROWS", 10**6)
     monkeypatch.setattr(turns, "ROW_DEG", 1e-9)
     single = observed(sensor, 0.004)
     assert rows.samples == single.samples
@@ -79,3 +85,21 @@ def test_white_noise_within_rows_is_that_of_the_samples() -> None:
     unit = UnitDescription("U1", interval_s=0.005, course=COURSE)
     white = simulate_unit(unit, 3, 0)[1]["gyroscope"]["noise"]["white"]
     assert sigma == pytest.approx(np.full(3, white), rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("time_offset", 0.008), ("time_offset", -0.003), ("low_pass_lag", 0.02), ("clock_rate", 60.0)]
+)
+def test_shifted_means_by_integrals_are_those_of_the_samples(name: str, value: float) -> None:
+    """Corners of 100 deg/s^2 in a row of four samples, of both motions: 2 dt 100 / 96 = 2.1e-3 deg/s; noise is 0.05."""
+    unit = UnitDescription("U1", interval_s=0.001, course=COURSE)
+    recording = next(r for r in simulate_unit(unit, 3, 0)[0] if r.role == "gyroscope")
+    motion = table_motion(recording, TABLE)
+    assert motion is not None
+    groups, shifted = turns.rows_of(motion, recording.valid), effect(name)
+    rows, samples = (shifted.moved(each, np.array([value])) for each in (groups.motion(motion), motion))
+    assert groups.count.max() > turns.ALL_SAMPLES
+    for field, most in {"angular_rate": 2.1e-3, "specific_force": 2e-6, "level": 2e-6, "angle": 1e-3}.items():
+        difference = getattr(rows, field) - groups.means(getattr(samples, field))
+        assert np.abs(difference).max() < most, field
+    np.testing.assert_array_equal(rows.reference_valid, groups.all(samples.reference_valid))

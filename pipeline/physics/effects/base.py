@@ -144,6 +144,11 @@ class Effect(abc.ABC):
         return type(self).moved is not Effect.moved
 
     @property
+    def has_slope(self) -> bool:
+        """Whether the effect states ``slope``."""
+        return type(self).slope is not Effect.slope
+
+    @property
     def uses_time_or_temperature(self) -> bool:
         """Whether its formula contains the time or the temperature; False for effects that move the motion in time."""
         return (self.needs_clock or "temperature" in self.needs) and not self.moves
