@@ -1,122 +1,17 @@
-"""The data that stages pass to each other: recordings, motions, noise and calibrations (frozen dataclasses)."""
+"""The data that stages pass to each other: recordings, motions, noise and calibrations (frozen dataclasses).
 
-from imu_logs.log import Index, Integers, Mask, Note, Values
-from imu_logs.units import AXES, SENSOR_UNITS, SENSORS
-from pipeline.core.records.budget import (
-    AFTER_BASE,
-    BASE,
-    BASE_COUNT,
-    BASE_NAMES,
-    BIAS,
-    BIAS_NAMES,
-    LACK_OF_FIT,
-    LIMIT,
-    MATRIX,
-    MATRIX_NAMES,
-    MATRIX_ROWS,
-    MONTE_CARLO,
-    NORMAL,
-    NOT_ESTIMATED,
-    RECTANGULAR,
-    Budget,
-    BudgetLine,
-    Contribution,
-    Estimate,
-    MonteCarlo,
-    NoiseParts,
-    NoMonteCarlo,
-    NotIncluded,
-    Parameters,
-    as_json,
-    base_units,
-    base_values,
-    coverage_factor,
-    finite,
-    matrix_of,
-    standard_uncertainty,
-)
-from pipeline.core.records.calibration import (
-    READABLE_VERSIONS,
-    SCHEMA_VERSION,
-    Coefficient,
-    Convergence,
-    CorrectionStep,
-    Fit,
-    FittedEffect,
-    Multiply,
-    NotCalibrated,
-    OutlyingMove,
-    RestUse,
-    SensorCalibration,
-    StageDetails,
-    StageResult,
-    Subtract,
-    TurnAngle,
-    TurnAxes,
-    TwoSided,
-    calibrated,
-    corrected,
-    fit_from_json,
-)
-from pipeline.core.records.evaluation import (
-    FEWEST_MOVES,
-    Agreement,
-    Answer,
-    Candidate,
-    Dependence,
-    FittedForm,
-    LimitCheck,
-    MethodError,
-    MovesError,
-    OverTemperature,
-    RankedFormula,
-    Reduced,
-    SelectionErrors,
-    SensorDiagnosis,
-    SensorValidation,
-    StepErrors,
-    TableEvidence,
-    TemperatureBin,
-    Validation,
-    Wander,
-)
-from pipeline.core.records.recording import (
-    BETWEEN_ATTITUDES_S,
-    MEDIAN_SIZE,
-    NOISE_OF_ROWS,
-    Motion,
-    Noise,
-    Quantities,
-    Recording,
-    Same,
-    UnitRecordings,
-    WanderLikelihood,
-    conjugate_product,
-    continuous,
-    cross,
-    files_of_readings,
-    level_in_body,
-    median,
-    motion_at_rest,
-    noise_of_steps,
-    once,
-    once_of_log,
-    rate_of_attitude,
-)
+The package has the public names of its modules, and those of ``imu_logs`` that come with them.
+"""
 
-__all__ = [
-    "AFTER_BASE", "AXES", "BASE", "BASE_COUNT", "BASE_NAMES", "BETWEEN_ATTITUDES_S", "BIAS", "BIAS_NAMES",
-    "FEWEST_MOVES", "LACK_OF_FIT", "LIMIT", "MATRIX", "MATRIX_NAMES", "MATRIX_ROWS", "MEDIAN_SIZE", "MONTE_CARLO",
-    "NOISE_OF_ROWS", "NORMAL", "NOT_ESTIMATED", "READABLE_VERSIONS", "RECTANGULAR", "SCHEMA_VERSION", "SENSORS",
-    "SENSOR_UNITS", "Agreement", "Answer", "Budget", "BudgetLine", "Candidate", "Coefficient", "Contribution",
-    "Convergence", "CorrectionStep", "Dependence", "Estimate", "Fit", "FittedEffect", "FittedForm", "Index",
-    "Integers", "LimitCheck", "Mask", "MethodError", "MonteCarlo", "Motion", "MovesError", "Multiply", "NoMonteCarlo",
-    "Noise", "NoiseParts", "NotCalibrated", "NotIncluded", "Note", "OutlyingMove", "OverTemperature", "Parameters",
-    "Quantities", "RankedFormula", "Recording", "Reduced", "RestUse", "Same", "SelectionErrors", "SensorCalibration",
-    "SensorDiagnosis", "SensorValidation", "StageDetails", "StageResult", "StepErrors", "Subtract", "TableEvidence",
-    "TemperatureBin", "TurnAngle", "TurnAxes", "TwoSided", "UnitRecordings", "Validation", "Values", "Wander",
-    "WanderLikelihood", "as_json", "base_units", "base_values", "calibrated", "conjugate_product", "continuous",
-    "corrected", "coverage_factor", "cross", "files_of_readings", "finite", "fit_from_json", "level_in_body",
-    "matrix_of", "median", "motion_at_rest", "noise_of_steps", "once", "once_of_log", "rate_of_attitude",
-    "standard_uncertainty",
-]  # fmt: skip
+from imu_logs.log import Index as Index
+from imu_logs.log import Integers as Integers
+from imu_logs.log import Mask as Mask
+from imu_logs.log import Note as Note
+from imu_logs.log import Values as Values
+from imu_logs.units import AXES as AXES
+from imu_logs.units import SENSOR_UNITS as SENSOR_UNITS
+from imu_logs.units import SENSORS as SENSORS
+from pipeline.core.records.budget import *  # noqa: F403
+from pipeline.core.records.calibration import *  # noqa: F403
+from pipeline.core.records.evaluation import *  # noqa: F403
+from pipeline.core.records.recording import *  # noqa: F403
