@@ -1,7 +1,7 @@
 """Packs: ZIP archives, each with the files that one stage writes for all units of a batch.
 
 The CRC-32 of a member is checked at each reading. Text is deflated; Parquet is already compressed and is stored, as are
-pages that ``gather`` publishes one by one, whose charts' numbers hardly shrink (7 ms a unit).
+pages that ``gather`` publishes one by one (515 kB: deflated to 216 kB in 5.4 ms, inflated in 1.3 ms).
 Members have no time, so equal files give equal bytes.
 
 Up to ``publish_limit`` units, the files of each unit are published one by one. Above it the packs of each batch are
