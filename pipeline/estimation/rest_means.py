@@ -43,7 +43,7 @@ from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, us
 ROLE, HELD_OUT = "rests", "validation"
 SOAK, ATTITUDES = "soak", "attitudes"  # kinds of recordings in the sheet; times of attitudes do not count
 BY_HAND = ("", "moves")  # kinds with rests and moves by hand, of which some are held out; "": without a sheet
-OF_ALL = ("clock_shared", "kinds", "swings", "repeats")  # fields of ``Rests`` that are no arrays
+OF_ALL = ("clock_shared", "kinds", "swings", "repeats", "scatter_time")  # fields of ``Rests`` that are no arrays
 PASSED, MOST = 20, 0.5  # temperatures between the ends of a soak; the share of them that makes a second cycle
 
 
@@ -230,6 +230,7 @@ class Rests:
     clock_shared: bool  # whether the time between the recordings is known
     kinds: frozenset[str] = frozenset()  # of the recordings, in the sheet
     swings: bool = False  # whether the temperature rises and falls in the recordings
+    scatter_time: float = 0.0  # s; correlation time of their scatter beyond white noise, in slow movement
     repeats: bool = True  # whether soaks, if any, pass most temperatures twice in one direction
 
     def select(self, index: Mask | slice) -> Self:
@@ -317,7 +318,14 @@ def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, 
     used = [recordings[index] for index in chosen]
     swings = heats_and_cools(temperature_of(r) for r in used if r.temperature is not None and r.kind != ATTITUDES)
     repeats = passed_again(columns["temperature"][columns["soaked"]])
-    return Rests(**columns, clock_shared=shared, kinds=frozenset(r.kind for r in used), swings=swings, repeats=repeats)
+    return Rests(
+        **columns,
+        clock_shared=shared,
+        kinds=frozenset(r.kind for r in used),
+        swings=swings,
+        repeats=repeats,
+        scatter_time=0.0,
+    )
 
 
 def passed_again(temperature: Values) -> bool:

@@ -205,6 +205,7 @@ class StageDetails:
     rests_held_out: Sequence[RestUse] | None = None
     known_by_limit: Mapping[str, float] | None = None  # parameters with a pseudo-observation, each with its u
     scatter_between_rests: float | None = None
+    scatter_time_s: float | None = None  # of slow movement: correlation time of its accelerations
     noise_of_means: float | None = None  # standard deviation of a mean that was recorded as such, by their scatter
     largest_error: float | None = None
     rests_on_faces: Mapping[str, int] | None = None

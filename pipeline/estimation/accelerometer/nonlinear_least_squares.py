@@ -30,6 +30,7 @@ from pipeline.core.records import (
     BASE_COUNT,
     BIAS,
     MATRIX,
+    MEDIAN_SIZE,
     Estimate,
     Multiply,
     Noise,
@@ -98,6 +99,7 @@ FEWEST_TO_JUDGE = 18  # rests, two for each parameter
 OUTLIER_SHARE = 0.2  # of the rests, the most that are called outliers
 MIN_OWN_SHARE = 0.01  # of the assumed variance of a mean: averages over 100 s
 MAX_COVARIANCE_ROWS = 600  # for which errors are drawn from a covariance
+KNOCK, LARGEST_CORRELATION = 3.0, 0.95  # deviations of a part by a knock; of successive parts, so that T stays finite
 OF_LENGTH = {
     **NOT_INCLUDED,
     "table angle, rate and orthogonality, levelling": "the length of gravity does not change with the attitude",
@@ -187,6 +189,9 @@ def _fit_triangular(task: StageInput) -> SensorCalibration:
     while refused := _outlier(rows, solved):
         rows = _without(rows, refused)
         solved = determined(rows)
+    if "slow" in rows.rests.kinds and (time := _scatter_time(rows, solved)):
+        rows = replace(rows, rests=replace(rows.rests, scatter_time=time))
+        solved = determined(rows)
     fitted, before = solved.fit, SensorCalibration("accelerometer", stages=task.stages)
     if not rows.by_hand and solved.spare > 1:
         return _on_table(rows, solved, before, prior, settings)
@@ -214,6 +219,23 @@ def _with_noise_of_means(rows: Orientations, solved: _Solved) -> Orientations:
     excess = min(float(residual @ residual) / solved.spare - 1.0, 0.0)
     own = np.maximum(rows.rests.own + excess * deviation**2, MIN_OWN_SHARE * rows.rests.own)
     return replace(rows, rests=replace(rows.rests, own=own))
+
+
+def _scatter_time(rows: Orientations, solved: _Solved) -> float:
+    """Return the time T in which accelerations of slow movement decay to 37 %, s; 0 where none is seen.
+
+    By the covariance c of successive parts, d apart, and the variance s^2 beyond white noise: ``c = s^2 exp(-d / T)``.
+    """
+    slow = np.array([rows.recordings[i].kind == "slow" for i in rows.rests.recording.tolist()])
+    both = slow[1:] & slow[:-1] & (np.diff(rows.rests.recording) == 0)
+    limit = KNOCK * MEDIAN_SIZE * float(np.median(np.abs(solved.error[slow])))
+    error, white = np.clip(solved.error, -limit, limit), solved.fit.error[solved.rows] ** 2
+    excess = float(np.mean(error[slow] ** 2 - white[slow]))
+    alike = float(np.mean((error[1:] * error[:-1])[both])) / excess if excess > 0.0 and both.any() else 0.0
+    if alike <= 2.0 / max(float(both.sum()), 1.0) ** 0.5:
+        return 0.0
+    apart = float(np.median(np.diff(rows.rests.time)[both]))
+    return apart / -float(np.log(min(alike, LARGEST_CORRELATION)))
 
 
 def _without(rows: Orientations, refused: Mapping[int, str]) -> Orientations:
@@ -429,6 +451,7 @@ def _stage(rows: Orientations, solved: _Solved, covariance: Values, freedom: flo
         known_by_limit=solved.model.known_by_limit,
         white_noise=float(np.sqrt(np.mean(rows.white**2))),
         scatter_between_rests=solved.between,
+        scatter_time_s=rows.rests.scatter_time or None,
         noise_of_means=float(np.sqrt(np.mean(rows.rests.own))) if np.all(rows.rests.own > 0.0) else None,
         largest_error=float(np.max(np.abs(solved.error))),
         condition=solved.fit.condition,

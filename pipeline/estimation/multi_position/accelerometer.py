@@ -176,6 +176,7 @@ class AccelerometerModel:
             (along * self.white / error[:, None]).T[:, :, None] * self.shares,
             self.stretches,
             scattered=True,
+            alike=self._alike(error) if rests.scatter_time else None,
         )
         if self.faces is None:
             columns = self.directions[:, [PARAMETERS.index(name) for name in self.known_by_limit]].T
@@ -194,6 +195,13 @@ class AccelerometerModel:
             np.einsum("rmc,c->crm", WM, self.white) / wide[:, None],
         )
         return stacked([of_rests, of_faces], self, state, candidates)
+
+    def _alike(self, error: Values) -> Values:
+        """Return the covariance of the scatter between the rests, (m, m), over their standard deviations (m,)."""
+        rests, size = self.rests, np.median(error) / error
+        apart = np.abs(rests.time[:, None] - rests.time) / rests.scatter_time
+        same = (rests.recording[:, None] == rests.recording) & ~np.eye(len(size), dtype=bool)
+        return np.asarray(np.where(same, np.exp(-apart) * np.outer(size, size), 0.0))
 
     def _shares(self, rests: Rests) -> Values:
         """Return the shares of rests that are no soaks, and of the parts of soaks, in each rest: (m, t) array."""
@@ -346,6 +354,8 @@ def model_of(
     by_limit = {name: u for detail in details for name, u in (detail.known_by_limit or {}).items()}
     for noise_of_means in (detail.noise_of_means for detail in details if detail.noise_of_means is not None):
         used = replace(used, own=np.full(len(used.time), noise_of_means**2))
+    for detail in details:
+        used = replace(used, scatter_time=detail.scatter_time_s or used.scatter_time)
     directions = _directions(calibration)
     return AccelerometerModel(
         used, directions, gravity, noise, held=held, faces=faces, known_by_limit=by_limit, soaks=soaks

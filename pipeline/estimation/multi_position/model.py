@@ -8,7 +8,7 @@ r   : (n,) residuals, each over its standard deviation by white noise
 X   : (n, p) derivatives of the model with respect to its parameters; d: a step of the parameters
 S   : (n, n) covariance by errors of the accelerometer, which equations of the gyroscope share
 g_j : (n,) variance of the scatter of the rests, or of the moves, beyond white noise (tremor), in units of the median
-      white error; a_j is its size
+      white error; a_j is its size. In slow movement ``exp(-|t_i - t_j| / T)`` is its correlation
 D   : (n, n) covariance by errors of the direction of gravity at each rest, as large as the median white error of a
       move; two moves share each error; c is their size (a support that yields, a hand that drifts)
 H   : (n, 3 t) derivatives with respect to the bias of each axis in each of t stretches of time, over its white noise
@@ -140,6 +140,7 @@ class Equations:
     common: Values | None = None
     direction: Values | None = None
     frame: Values | None = None  # (n, 3); F
+    alike: Values | None = None  # (n, n); covariance of the scatter between rests of slow movement, for a_0 = 1
     stated: int = 0  # number of the last equations, which are pseudo-observations of limits
     _kernels: dict[float, Values] = field(default_factory=dict, compare=False, repr=False)
 
@@ -159,6 +160,8 @@ class Equations:
         C.flat[:: n + 1] += self.variance(noise)
         if self.direction is not None and noise.direction:
             C += noise.direction**2 * self.direction
+        if self.alike is not None:
+            C += noise.scatter[0] ** 2 * self.alike
         if noise.bias.ratio:
             if noise.bias.time not in self._kernels:
                 R = np.where(self.joined, block_covariance(self.start, self.length, noise.bias.time), 0.0)
@@ -179,7 +182,7 @@ class Equations:
 
     def factor(self, noise: NoiseHypothesis) -> tuple[Values, float]:
         """Return the lower triangular L, or its diagonal where C is diagonal, and log det C."""
-        if self.common is None and not noise.direction and not noise.bias.ratio:
+        if self.common is None and self.alike is None and not noise.direction and not noise.bias.ratio:
             variance = self.variance(noise)
             return np.sqrt(variance), float(np.sum(np.log(variance)))
         L, failed = scipy.linalg.lapack.dpotrf(self.covariance(noise).T, lower=1, clean=0, overwrite_a=1)
@@ -215,6 +218,7 @@ class EquationBlock:
     frame: Values | None = None  # (n, 3); F; None: zeros
     shared: Values | None = None  # (n, 12); change of moves by errors of the accelerometer's calibration
     force: Values | None = None  # (n, m, 3); change of moves by the specific force at each rest, per g
+    alike: Values | None = None  # (n, n), of ``Equations``
     stated: bool = False  # whether they are pseudo-observations of limits; the last block
 
 
@@ -268,6 +272,7 @@ def stacked(
         common=common,
         direction=diagonal([block.direction for block in blocks]),
         frame=frame,
+        alike=diagonal([block.alike for block in blocks]),
         stated=sizes[-1] if blocks[-1].stated else 0,
     )
 

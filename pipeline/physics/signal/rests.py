@@ -69,7 +69,7 @@ SETTLED_SHARE = 0.1  # of the noise of the mean of all rests, see above
 
 RESTS = "rests"  # in the source of a recording on a table (of a sheet): start and stop of each rest by its log
 RATE_AT_REST = "rate_at_rest_dps"  # in the source of a turn: what the gyroscope reads in the recordings at rest
-SLOW_PARTS, SLOW_PART_S = 120, 0.2  # parts of slow movement: a turn at 30 deg/s shortens their mean by 0.5 mg
+SLOW_PARTS, SLOW_PART_S = 400, 0.2  # parts of slow movement: a turn at 30 deg/s shortens their mean by 0.5 mg
 SOAK_PARTS = 40  # of a soak: over a span of 80 degC, 2 degC each
 
 
@@ -151,9 +151,9 @@ def find_rests(recording: Recording) -> list[Rest]:
         return [Rest(a, b) for a, b in pairwise(edges.tolist())]
     if recording.kind == "slow":
         size = max(5, round(SLOW_PART_S / _interval(recording))) if recording.samples > 1 else 1
-        starts = np.unique(np.linspace(0, max(recording.samples - size, 0), SLOW_PARTS).astype(int))
-        apart = starts[np.concatenate([[True], np.diff(starts) >= size])]
-        return [Rest(a, min(a + size, recording.samples)) for a in apart.tolist()]
+        count = max(min(SLOW_PARTS, recording.samples // size), 1)
+        starts = np.linspace(0, max(recording.samples - size, 0), count).astype(int)
+        return [Rest(a, min(a + size, recording.samples)) for a in starts.tolist()]
     if recording.kind == "attitudes":
         starts = np.flatnonzero(np.diff(recording.time_ns) > 0.5 * BETWEEN_ATTITUDES_S * 1e9) + 1
         return [Rest(a, b) for a, b in pairwise([0, *starts.tolist(), recording.samples])]

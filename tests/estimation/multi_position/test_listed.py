@@ -466,6 +466,23 @@ def test_rows_beyond_the_soaked_temperatures_are_marked_or_refused(tmp_path: Pat
     assert not (tmp_path / "refused.csv").exists()
 
 
+def test_slow_movement_is_used_whole_and_its_accelerations_are_not_independent(tmp_path: Path) -> None:
+    """Parts of 0.2 s follow one another; of a movement of 20 s one part was used."""
+    rng, n, keep = np.random.default_rng(9), 2000, np.exp(-0.01 / 0.3)
+    z, angle = np.linspace(-1.0, 1.0, n), np.linspace(0.0, 12.0 * np.pi, n)
+    up = np.stack([np.sqrt(1.0 - z**2) * np.cos(angle), np.sqrt(1.0 - z**2) * np.sin(angle), z], axis=1)
+    drive = 3e-3 * np.sqrt(1.0 - keep**2) * rng.normal(size=(n, 3))
+    force = up + scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0) + 1e-3 * rng.normal(size=(n, 3))
+    table_, header = np.column_stack([np.arange(n) / 100.0, force]), "time_s,accel_x_g,accel_y_g,accel_z_g"
+    np.savetxt(tmp_path / "f.csv", table_, fmt="%.8g", delimiter=",", header=header, comments="")
+    (tmp_path / "recordings.csv").write_text("file,kind\nf.csv,slow\n")
+    part = calibrated(tmp_path).calibration["accelerometer"]
+    details = part["stages"][0]["details"]
+    assert details["orientations_used"] == 100
+    assert details["scatter_time_s"] == pytest.approx(0.3, abs=0.2)  # 60 independent values: ln of 0.5 +- 0.2
+    assert set(part["determined_by"]["bias"]) == {"recordings"}
+
+
 @pytest.mark.parametrize("kind", ["attitudes", "slow"])
 def test_differences_between_attitudes_are_no_noise(tmp_path: Path, kind: str) -> None:
     """They were exported as 4 g/sqrt(Hz), and slow movement as a random walk."""
