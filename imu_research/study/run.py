@@ -21,7 +21,9 @@ from dataclasses import replace
 from multiprocessing import get_context
 from typing import TYPE_CHECKING, Literal
 
-from imu_research.study.bench import at_detection, recordings_of, signals_left, withheld_of
+import numpy as np
+
+from imu_research.study.bench import GAUSS_MARKOV, at_detection, recordings_of, signals_left, withheld_of
 from imu_research.study.cases import METHODS, StudyCase, draw
 from pipeline.app.config import code_digest
 from pipeline.app.one_unit import unit_of_recordings, unit_row
@@ -201,6 +203,10 @@ def _raised(state: UnitState, added: UnitState, case: StudyCase) -> bool:
     noise = known.noises[case.sensor] if known else None
     if known is None or noise is None or len(fits) < 2:
         return False
+    if case.noise in GAUSS_MARKOV:  # the true wander
+        data_sheet = settings.sensor.of(case.sensor)
+        wander = np.full(3, case.wander * data_sheet.bias_wander)
+        noise = replace(noise, wander=wander, correlation_time=data_sheet.wander_time_s)
     seen = [r for r in known.filtered if case.by_hand or r.role != "validation"]
     recordings = [*seen, *([] if case.by_hand else [withheld_of(case)])]
     errors, times = errors_of(fits, HeldOutCase(fits[0], recordings, noise, settings).held_out_samples())

@@ -89,3 +89,14 @@ def test_an_effect_for_which_the_rests_of_the_published_fit_are_too_few_is_a_can
         "the 16 rests of the fit are too few for it: record at least 26 rests in as many "
     )
     assert part["answer_set"][0]["effects"] == ["cross_axis_nonlinearity"]
+
+
+def test_wander_that_only_the_turns_show_does_not_take_an_effect_away() -> None:
+    """Five times the sensor file's wander: it raises the held-out error, hysteresis has a delta BIC of 1082."""
+    case = draw("pairs_wander", 45, 5203)
+    _, state = diagnose_case(case)
+    part = state.diagnosis["accelerometer"]
+    assert "hysteresis" in case.hidden
+    assert (part["verdict"], part["selected"], part["candidates"]) == ("missing_effect", ["hysteresis"], [])
+    before, after = (part["ranking"][0][f"held_out_error_{when}"] for when in ("before", "after"))
+    assert after > before

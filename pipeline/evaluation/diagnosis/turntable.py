@@ -315,8 +315,9 @@ def _held_out(
 ) -> tuple[list[float], float, dict[str, str]]:
     """Return the held-out error of each fit, the noise floor of the last, and the effects that raise the error.
 
-    Effects are compared with the published calibration if it is by a table's motion, else with the base. Without
-    held-out motion the list is empty, and stretches of the turns that are left out judge the effects.
+    Effects are compared with the published calibration if it is by a table's motion, else with the base. The bias
+    wanders as in the recordings of the fit, if that is more than in a rest. Without held-out motion the list is empty,
+    and stretches of the turns that are left out judge the effects.
     """
     noise = case.noise or NOISELESS
     held_out = HeldOutCase(case.calibration, case.recordings, noise, case.settings)
@@ -327,6 +328,9 @@ def _held_out(
     before = case.calibration if last_fit(case.calibration).reference else calibrations[0]
     errors, time = errors_of([before, *calibrations], samples)
     floor, vector_floor = noise_floors(calibrations[-1], samples)
+    setting, wander = fits[-1].setting, fits[-1].setting.ratio * fits[-1].scale
+    if np.mean(wander**2) > np.mean(noise.wander**2):
+        noise = replace(noise, wander=wander, correlation_time=setting.time)
     return (
         np.sqrt(np.mean(np.sum(errors[1:] ** 2, axis=2), axis=1)).tolist(),
         floor if vector_floor is None or errors.shape[2] == 1 else vector_floor,
