@@ -27,7 +27,7 @@ import scipy
 
 from pipeline.core.records import BASE_COUNT, Values
 from pipeline.estimation.candidates import SECOND, SECOND_SHARE, time_constants
-from pipeline.estimation.design import BEND, Design, EffectColumns, placed
+from pipeline.estimation.design import BEND, Design, EffectColumns, free_curves, placed
 from pipeline.estimation.evidence import (
     LIMIT_SCALES,
     NEGLIGIBLE_MIXTURE_WEIGHT,
@@ -46,6 +46,7 @@ from pipeline.estimation.gauss_markov import WHITE_SETTING, random_walks
 from pipeline.estimation.generalized_least_squares import JointFit, design_at, fit_terms
 from pipeline.estimation.ranking import MIN_NEW_COLUMN_SHARE, without
 from pipeline.estimation.selection import DELAYS, Selection
+from pipeline.physics.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -63,6 +64,7 @@ EXTENDED_LOG_EVIDENCE = 7.0
 # number of these sets; iterations of the search for the best scales, and of exchanges
 MOST_NEAR, SCALE_SEARCH_ITERATIONS = 16, 3
 CERTAIN = 0.97  # largest stated probability: of the inclusions with 1.000, 96.6 % were right in those sensors
+SURE = 0.85  # least probability of an answer whose further effects are selected, see ``completed``
 ANSWER_SET_PROBABILITY = 0.95  # probability of an answer set
 UPPER_LIMIT_SHARE = 29.0 / 30.0  # of an upper limit, see above
 LIMIT_SET_SHARE = 0.05  # share of the best probability, above which a set is used for upper limits
@@ -343,6 +345,23 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
     of_fit = selection.fit.key, tuple(selection.names), selection.data_sheet.model_dump_json()
     key = posterior, *of_fit, frozenset(hidden), tuple(this.name for this in others)
     return selection.observations.once(key, lambda: _posterior(selection, hidden, others))
+
+
+def completed(selection: Selection) -> Selection:
+    """Return a selection with the other effects of its most probable answer, if that is ``SURE`` and has all selected.
+
+    A gate asks of each effect what rules out chance in a unit without one; beside effects that are shown, and where the
+    size of the other is known well (Earth's rotation), the evidence of the whole set is enough.
+    """
+    if not selection.names and not any(s.delta_bic > 0.0 and s.admissible for s in selection.alone.values()):
+        return selection
+    observations, sensor = selection.observations, selection.observations.sensor
+    bent = any(effect(name).of_the_room(sensor) for name in selection.names)
+    curves = free_curves(sensor, [part.motion for part in observations.parts], bent=bent)
+    names, probability = posterior(selection, (), curves).sets[0]
+    more = [name for name in names if name not in selection.names]
+    whole = probability >= SURE and len(names) == len(selection.names) + len(more)
+    return selection.with_more(more) if more and whole else selection
 
 
 def _posterior(selection: Selection, hidden: Collection[str], others: Sequence[Effect]) -> Answers:

@@ -137,6 +137,20 @@ class Selection:
                 self._forward()
                 self._fit_selected()
 
+    def with_more(self, names: Sequence[str]) -> Selection:
+        """Return the selection with further effects; itself if one of them is not possible or lowers the BIC."""
+        found = replace(self, steps=dict(self.steps), fits=dict(self.fits), refused=set(self.refused))
+        for name in names:
+            score = found._given(found.names).get(name)  # noqa: SLF001  (of this class)
+            if score is not None and effect(name).nonlinear:
+                score = found._refined(score)  # noqa: SLF001
+            if score is None or not score.delta_bic > 0.0 or not (score.admissible and score.plausible):
+                return self
+            if not found._possible(name, found.names) or not found._accept({**found.steps, name: score}):  # noqa: SLF001
+                return self
+            found._refit()  # noqa: SLF001
+        return found
+
     def _forward(self) -> None:
         for _ in range(3 * MAX_SELECTED_EFFECTS):
             if len(self.names) == MAX_SELECTED_EFFECTS:

@@ -32,7 +32,7 @@ from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import JointFit, calibration_of
 from pipeline.estimation.harm import fits_of, harmful_in_turns, harmful_on_held_out
 from pipeline.estimation.observations import ROLES, observe, without_each_recording
-from pipeline.estimation.posterior import posterior
+from pipeline.estimation.posterior import completed, posterior
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.estimation.stages import last_fit
@@ -185,7 +185,7 @@ def findings(case: DiagnosisInput) -> Findings:
     """
     observations = observe(case.sensor, case.recordings, case.settings.table)
     known = case.noise, case.data_sheet, case.calibration
-    selection = select(observations, case.configured, *known, accelerometer=case.accelerometer)
+    selection = completed(select(observations, case.configured, *known, accelerometer=case.accelerometer))
     unknown = dependences(selection)
 
     def search() -> Findings | None:
