@@ -22,8 +22,9 @@ import pandas as pd
 
 from imu_research.figures import MeasuredFigure, clustered_share, share, write_figures
 from pipeline.app.one_unit import unit_of_recordings, unit_row
-from pipeline.core.records import SENSORS
+from pipeline.core.records import SENSORS, Recording
 from pipeline.estimation.uncertainty_budget import limited_effects
+from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 
@@ -46,6 +47,16 @@ def _lower(matrix: np.ndarray) -> np.ndarray:
     return Q * np.sign(np.diag(Q.T @ matrix))
 
 
+def _at_mean_temperature(truth: dict, effect: str, slope: list[float], recordings: list[Recording]) -> dict:
+    """Return the truth of the matrix at the recordings' mean temperature, which a fit without its slope determines."""
+    sensor, _, name = effect.partition(".")
+    if name != "scale_factor_temperature":
+        return truth
+    warmer = np.mean(np.concatenate([r.temperature for r in recordings])) - REFERENCE_TEMPERATURE
+    K = np.linalg.inv(truth[sensor]["matrix"]) + warmer * np.diag(slope)
+    return truth | {sensor: truth[sensor] | {"matrix": np.linalg.inv(K).tolist()}}
+
+
 def errors_of(procedure: str, effect: str, limit: np.ndarray | None, seed: int) -> list[dict]:
     """Return for each sensor the errors of bias and matrix, both uncertainties and the verdict of one unit."""
     rng = np.random.default_rng([seed, 38])
@@ -53,6 +64,8 @@ def errors_of(procedure: str, effect: str, limit: np.ndarray | None, seed: int) 
     described = {"table": "hand", **PROCEDURES[procedure]}
     unit = UnitDescription("U", procedure=procedure, effects=hidden, **described)
     recordings, truth = simulate_unit(unit, seed, 0)
+    if limit is not None:
+        truth = _at_mean_temperature(truth, effect, hidden[effect], recordings)
     layers = [f"table={unit.table}", f"procedure={procedure}", "sensor=mpu6050"]
     layers += ["method=rests_and_moves"] if procedure == "multi_position" else []
     began = time.process_time()
