@@ -136,6 +136,8 @@ class Selection:
             if self._other_delay():
                 self._forward()
                 self._fit_selected()
+        # without the designs of other fits, which would be kept as long as the unit
+        self.fits = {names: fit if fit is self.fit else replace(fit) for names, fit in self.fits.items()}
 
     def with_more(self, names: Sequence[str]) -> Selection:
         """Return the selection with further effects; itself if one of them is not possible or lowers the BIC."""
