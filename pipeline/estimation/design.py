@@ -98,7 +98,7 @@ class EffectColumns:
     def key(self) -> tuple[Hashable, ...]:
         """What the columns and the prior follow from, for the observations of one unit."""
         prior = self.prior and (self.prior.mean.tobytes(), self.prior.precision.tobytes())
-        return self.effect.name, self.values.tobytes(), self.full, prior
+        return self.effect, self.values.tobytes(), self.full, prior  # two formulas of a search may have one name
 
     def layout(self) -> Layout:
         """Return the layout of the effect's columns."""

@@ -19,6 +19,7 @@ from pipeline.estimation.multi_position.model import Model, selection_hypotheses
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import SelectionByHand, fit_configured, refusal
 from pipeline.estimation.noise import with_noises
+from pipeline.estimation.observability import hidden_in
 from pipeline.estimation.observations import observe
 from pipeline.estimation.posterior import completed
 from pipeline.estimation.rest_means import ROLE, is_multi_position
@@ -50,7 +51,8 @@ def fit(task: StageInput) -> SensorCalibration:
         if not observations.parts:
             return before
         data_sheet = settings.sensor.of(sensor)
-        chosen = completed(select(observations, names, noise, data_sheet, accelerometer=accelerometer))
+        chosen = select(observations, names, noise, data_sheet, accelerometer=accelerometer)
+        chosen = completed(chosen, lambda each: hidden_in(each, names))
         added = offered(chosen.names, chosen.fit.terms, chosen.fit.covariance, data_sheet, sensor)
         harm = harmful_in_turns(chosen, fits_of(chosen)) if added else {}
         names += [name for name in added if name not in harm]

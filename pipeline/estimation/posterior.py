@@ -64,7 +64,7 @@ EXTENDED_LOG_EVIDENCE = 7.0
 # number of these sets; iterations of the search for the best scales, and of exchanges
 MOST_NEAR, SCALE_SEARCH_ITERATIONS = 16, 3
 CERTAIN = 0.97  # largest stated probability: of the inclusions with 1.000, 96.6 % were right in those sensors
-SURE = 0.85  # least probability of an answer whose further effects are selected, see ``completed``
+SURE = 0.9  # least probability of an answer whose further effects are selected, see ``completed``
 ANSWER_SET_PROBABILITY = 0.95  # probability of an answer set
 UPPER_LIMIT_SHARE = 29.0 / 30.0  # of an upper limit, see above
 LIMIT_SET_SHARE = 0.05  # share of the best probability, above which a set is used for upper limits
@@ -347,23 +347,29 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
     return selection.observations.once(key, lambda: _posterior(selection, hidden, others))
 
 
-def completed(selection: Selection) -> Selection:
+def completed(selection: Selection, hidden: Callable[[Selection], Collection[str]]) -> Selection:
     """Return a selection with the other effects of its most probable answer, if that is ``SURE`` and has all selected.
 
-    A gate asks of each effect what rules out chance among all candidates; where the size of an effect is known well
-    (Earth's rotation), or beside effects that are shown, the evidence of the whole set is enough. A slow effect joins
-    others only: alone, it was drift in 2 of 864 sensors without one, both with a random walk of the bias.
+    ``hidden`` returns the effects that the recordings cannot show. A gate asks of each effect what rules out chance
+    among all candidates; where the size of an effect is known well (Earth's rotation), or beside effects that are
+    shown, the evidence of the whole set is enough. A slow effect joins others only: alone, it was drift in 2 of 864
+    sensors without one, both with a random walk of the bias.
     """
     if not selection.names and not any(s.delta_bic > 0.0 and s.admissible for s in selection.alone.values()):
         return selection
-    observations, sensor = selection.observations, selection.observations.sensor
-    bent = any(effect(name).of_the_room(sensor) for name in selection.names)
-    curves = free_curves(sensor, [part.motion for part in observations.parts], bent=bent)
-    names, probability = posterior(selection, (), curves).sets[0]
+    curves = curves_of(selection) if selection.names else ()
+    names, probability = posterior(selection, hidden(selection), curves).sets[0]
     more = [name for name in names if name not in selection.names]
     whole = probability >= SURE and len(names) == len(selection.names) + len(more)
-    alone = not selection.names and any(name in catalogue() and effect(name).of_the_room(sensor) for name in more)
-    return selection.with_more(more) if more and whole and not alone else selection
+    slow = any(name in catalogue() and effect(name).of_the_room(selection.observations.sensor) for name in more)
+    return selection.with_more(more) if more and whole and (selection.names or not slow) else selection
+
+
+def curves_of(selection: Selection) -> list[Effect]:
+    """Return the free curves of the covariates that vary, bent where an effect of the temperature is selected."""
+    observations, sensor = selection.observations, selection.observations.sensor
+    bent = any(effect(name).of_the_room(sensor) for name in selection.names)
+    return free_curves(sensor, [part.motion for part in observations.parts], bent=bent)
 
 
 def _posterior(selection: Selection, hidden: Collection[str], others: Sequence[Effect]) -> Answers:

@@ -19,7 +19,7 @@ Compute how each effect of the sensor file, at its limit, would change bias and 
 
 with the linear map A of the fit from its readings (``pipeline.estimation.engine``) or equations to its parameters, and
 the column z of parameter j of the effect. Where the recordings leave the effect open
-(``pipeline.evaluation.diagnosis.observability``), the largest change is not in the expanded uncertainty: the
+(``pipeline.estimation.observability``), the largest change is not in the expanded uncertainty: the
 calibration states it apart (``pipeline.physics.compensation``).
 
 An error of the accelerometer by hand changes the direction of gravity, to which the moves of the gyroscope refer:

@@ -28,10 +28,10 @@ from pipeline.core.records import Noise, Recording, SensorCalibration
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.observability import not_observable
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
 from pipeline.estimation.stages import StageInput
-from pipeline.evaluation.diagnosis.observability import not_observable
 from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.physics.effects import effect_from, forget, register
 from pipeline.physics.kinematics import table_motion

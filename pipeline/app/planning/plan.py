@@ -33,11 +33,11 @@ from pipeline.core.errors import NotObservableError
 from pipeline.core.records import AXES, SENSORS, Fit, Noise, NotCalibrated, Recording, SensorCalibration
 from pipeline.core.settings import DataSheet, Settings, assumed_figures
 from pipeline.estimation.multi_position import selection as by_hand
+from pipeline.estimation.observability import at_its_limit, not_observable, not_observable_by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
 from pipeline.evaluation.diagnosis.multi_position import require_model
-from pipeline.evaluation.diagnosis.observability import at_its_limit, not_observable, not_observable_by_hand
 from pipeline.ingest.files import recordings_of_text
 from pipeline.output.pages.pages import template
 from pipeline.physics.effects import effect

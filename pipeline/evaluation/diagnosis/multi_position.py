@@ -44,12 +44,12 @@ from pipeline.estimation.multi_position.model import NoiseHypothesis
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import LAG, SelectionByHand, hysteresis_of, posterior
 from pipeline.estimation.noise import noise_of
+from pipeline.estimation.observability import MORE_RESTS, never_shown, not_observable_by_hand, slow_by_hand
 from pipeline.estimation.rest_means import held_out_rests
 from pipeline.estimation.stages import StageInput, is_given
 from pipeline.evaluation.diagnosis import functional_forms as forms
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.evaluation.diagnosis.method_errors import given_differences
-from pipeline.evaluation.diagnosis.observability import MORE_RESTS, never_shown, not_observable_by_hand, slow_by_hand
 from pipeline.evaluation.diagnosis.residual_dependence import added_variable_of_rests, significant
 from pipeline.evaluation.diagnosis.verdict import verdict_of_selection_by_hand
 from pipeline.evaluation.diagnosis.words import HYSTERESIS, listed, plain

@@ -26,27 +26,27 @@ from pipeline.core.errors import ConvergenceError
 from pipeline.core.records import BASE_COUNT, Noise, SelectionErrors, SensorCalibration, TableEvidence
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import turns_of
-from pipeline.estimation.design import Design, EffectColumns, free_curves, placed
+from pipeline.estimation.design import Design, EffectColumns, placed
 from pipeline.estimation.gates import min_delta_bic
 from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import JointFit, calibration_of
 from pipeline.estimation.harm import fits_of, harmful_in_turns, harmful_on_held_out
+from pipeline.estimation.observability import alike_with_zeros, hidden_in, never_shown, not_observable, one_way
 from pipeline.estimation.observations import ROLES, observe, without_each_recording
-from pipeline.estimation.posterior import completed, posterior
+from pipeline.estimation.posterior import completed, curves_of, posterior
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.estimation.stages import last_fit
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
 from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, why_not_suggested
 from pipeline.evaluation.diagnosis.method_errors import method_errors
-from pipeline.evaluation.diagnosis.observability import alike_with_zeros, never_shown, not_observable, one_way
 from pipeline.evaluation.diagnosis.residual_dependence import dependences, goodness_of_fit, plots
 from pipeline.evaluation.diagnosis.verdict import verdict_of_selection
 from pipeline.evaluation.diagnosis.words import FAR_OFF, plain
 from pipeline.evaluation.held_out.error_breakdown import errors_of
 from pipeline.evaluation.held_out.samples import HeldOutCase
 from pipeline.evaluation.held_out.validation import noise_floors
-from pipeline.physics.effects import catalogue, effect
+from pipeline.physics.effects import catalogue
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -185,7 +185,8 @@ def findings(case: DiagnosisInput) -> Findings:
     """
     observations = observe(case.sensor, case.recordings, case.settings.table)
     known = case.noise, case.data_sheet, case.calibration
-    selection = completed(select(observations, case.configured, *known, accelerometer=case.accelerometer))
+    selected = select(observations, case.configured, *known, accelerometer=case.accelerometer)
+    selection = completed(selected, lambda each: hidden_in(each, case.modelled))
     unknown = dependences(selection)
 
     def search() -> Findings | None:
@@ -232,9 +233,7 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     least = squares[-1] if noise_square is None else noise_square
     at_noise = not reported.names and squares[0] < UNEXPLAINABLE_RATIO * least
     excess = squares[0] if at_noise else squares[0] - min(least, squares[-1])
-    motions = [part.motion for part in observations.parts]
-    bent = any(effect(name).of_the_room(sensor) for name in selection.names)
-    curves = free_curves(sensor, motions, bent=bent) if selection.names or unknown else []
+    curves = curves_of(selection) if selection.names or unknown else []
     answers = posterior(selection, never_shown(hidden, reported.names), curves)
     verdict = verdict_of_selection(
         reported.names,

@@ -78,6 +78,11 @@ def never_shown(hidden: Collection[str], selected: Collection[str]) -> list[str]
     return [name for name in hidden if not any(name in effect(other).contains for other in selected)]
 
 
+def hidden_in(selection: Selection, modelled: Sequence[str]) -> list[str]:
+    """Return ``never_shown`` of turns on a table."""
+    return never_shown(not_observable(selection, modelled), selection.names)
+
+
 def one_way(observations: Observations) -> bool:
     """Return whether the table turns, but about no axis in both directions."""
     signs: dict[int, set[float]] = {}
