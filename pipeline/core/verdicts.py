@@ -268,7 +268,7 @@ def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False
 
     ``once``: each unit by its most urgent problem alone.
     """
-    groups: dict[tuple[str, tuple[str, ...]], list[tuple[float, str, str, list[str], str]]] = {}
+    groups: dict[tuple[str, tuple[str, ...]], list[tuple[float, str, str, list[str], list[str]]]] = {}
     for row, errors, kinds in map(state_of, rows):
         for kind, sensors in [*kinds.items()][: 1 if once else None]:
             effects: tuple[str, ...] = ()
@@ -276,12 +276,13 @@ def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False
                 names = [(s, (row.get(f"{s}_selected") or "").split(";")) for s in sensors]
                 effects = tuple(f"{s}.{name}" for s, chosen in names for name in chosen if name)
             ratio, worst = max(((errors[s].ratio or 0.0, s) for s in sensors), default=(0.0, ""))
-            step, decided = (row.get(f"{worst}_{column}") or "" for column in ("next_step", "decided_by"))
+            step = row.get(f"{worst}_next_step") or ""
+            by = [row.get(f"{s}_decided_by") or "" for s in sorted(sensors, key=lambda s: s != worst)]
             if kind == FAR:
-                decided = next(filter(None, (_far_after_moves(row, s) for s in sensors)), "")
+                by = [next(filter(None, (_far_after_moves(row, s) for s in sensors)), "")]
                 moved = [_number(row.get(f"{s}_moves_over_noise")) or 0.0 for s in sensors]
                 ratio = max(ratio, *(over for over in moved if over > MARK_AFTER_MOVES), 0.0)
-            groups.setdefault((kind, effects), []).append((ratio, str(row["unit"]), step, sensors, decided))
+            groups.setdefault((kind, effects), []).append((ratio, str(row["unit"]), step, sensors, by))
     order, found = [*KINDS], []
     for (kind, effects), entries in sorted(groups.items(), key=lambda group: order.index(group[0][0])):
         entries.sort(key=lambda entry: -entry[0])
@@ -293,7 +294,7 @@ def problems(rows: Sequence[Mapping[str, Any] | RowState], *, once: bool = False
             others = len({entry[2] for entry in entries}) > 1
             step = entries[0][2] + f" ({entries[0][1]}; the pages of the others state theirs)" * others
         units, span = [unit for _, unit, *_ in entries], (known[-1], known[0]) if known else None
-        texts = [entry[4] for entry in entries]
+        texts = [text for entry in entries for text in entry[4]]
         decided = _decided(texts) if kind in DOUBTS or (kind == FAR and all(texts)) else ""
         found.append(Problem(kind, what, units, span, step, effects, decided))
     return found

@@ -82,6 +82,11 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Table, method:
         motion = table_motion(recording, table)
         if motion is not None:
             parts.append(TurnPart(recording, motion, recording.valid))
+    if not parts and sensor == "gyroscope" and any(r.role == "rests" and r.gyroscope is not None for r in recordings):
+        raise CannotCalibrateError(
+            f"{method} needs a table's motion for the gyroscope; where a hand moved the unit between rests in many "
+            "attitudes, method=rests_and_moves calibrates it; with a table, record turns about x, y and z"
+        )
     if not parts:
         lack = "none of them logs the table's angle" if usable else f"no recording of role {sensor} holds its readings"
         raise CannotCalibrateError(

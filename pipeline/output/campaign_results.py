@@ -103,6 +103,7 @@ class CampaignResults:
         answers in the answer set), ``_beyond_limits`` (parameters beyond the sensor file's limits), ``_implausible``,
         ``_not_in_uncertainty``, ``_not_held_out`` (why nothing was held out), ``_decided_by`` (the figure that
         decided the verdict); ``gyroscope_moves_over_noise`` (angle after held-out moves by hand); ``pass``;
+        ``state`` ("ready", or the most urgent kind of problem, as on the campaign's page);
         ``left_out`` (rows that no fit uses); ``incomplete`` (stages after the fit that failed, and why); and other
         columns of ``units.csv``.
         """

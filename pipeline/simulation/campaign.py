@@ -87,7 +87,7 @@ COMMENT = "# The table has no encoders: its program instead of its log. Written 
 UNITS_CSV_COLUMNS = (
     "unit", "serial", "lot", "date", "sensor", "table", "procedure", "method", "ingest", "filter", "overrides",
 )  # fmt: skip
-CAMPAIGN_YAML = "# Hydra overrides for all units of this campaign.\noverrides: []\n"
+CAMPAIGN_YAML = "# Hydra overrides for all units of this campaign.\noverrides: [{}]\n"
 
 
 class Streams:
@@ -422,7 +422,9 @@ def write_campaign(
         table.to_csv(columns=columns, index=False, lineterminator="\n"), encoding="utf-8"
     )
     if not (directory / "campaign.yaml").exists():
-        (directory / "campaign.yaml").write_text(CAMPAIGN_YAML, encoding="utf-8")
+        moves = all(unit.procedure == "multi_position" for unit in description.units)
+        overrides = "method=rests_and_moves" if moves else ""  # as ``new`` writes it: the moves calibrate the gyroscope
+        (directory / "campaign.yaml").write_text(CAMPAIGN_YAML.format(overrides), encoding="utf-8")
 
 
 def _sheet_rows(description: Description) -> list[dict[str, Any]]:

@@ -270,7 +270,7 @@ def test_a_log_of_two_files_is_guided_by_its_profile(tmp_path: Path, capsys: pyt
 def test_faces_and_turns_that_lack_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     whole = campaign(tmp_path / "faces", "ferraris", static_s=0.0)
     assert main(["guide", str(whole)]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "enough: all faces and turns are there"
+    assert capsys.readouterr().out.splitlines()[-1] == "enough for bias and matrix: all faces and turns are there"
     cut = whole.parents[2] / "configs" / "procedure" / "cut.yaml"  # a run cuts this recording into parts
     cut.parent.mkdir(parents=True)
     plain = (CONFIGS / "procedure" / "ferraris.yaml").read_text()
@@ -278,7 +278,7 @@ def test_faces_and_turns_that_lack_are_named(tmp_path: Path, capsys: pytest.Capt
     sheet = whole.parents[2] / "units.csv"
     sheet.write_text(sheet.read_text().replace("ferraris", "cut"))
     assert main(["guide", str(whole)]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "enough: all faces and turns are there"
+    assert capsys.readouterr().out.splitlines()[-1] == "enough for bias and matrix: all faces and turns are there"
     rows = whole.read_text().splitlines()
     seen = []
     for share in (0.2, 0.7):
@@ -312,7 +312,7 @@ def test_the_windows_of_a_procedure_are_read_as_a_run_reads_them(
     plain = (CONFIGS / "procedure" / "ferraris.yaml").read_text()
     sheet = whole.parents[2] / "units.csv"
     sheet.write_text(sheet.read_text().replace("ferraris", "parts"))
-    for count, said in ((0, "enough: all faces and turns are there"), (1, "next: +z up; ")):
+    for count, said in ((0, "enough for bias and matrix: all faces and turns are there"), (1, "next: +z up; ")):
         of = f"role: session, windows: [{', '.join(listed[: len(listed) - count])}],"
         parts.write_text(plain.replace("recording, role: rests,", f"recording, {of}"))
         assert main(["guide", str(whole)]) == 0

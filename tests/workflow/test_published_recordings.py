@@ -91,7 +91,7 @@ def test_a_third_of_the_rests_is_held_out_and_predicted(published: Bench) -> Non
 def test_the_gyroscope_that_hand_held_rests_do_not_give_is_null_with_the_reason(published: Bench, unit: str) -> None:
     found = document(published, "calibrations", unit)
     assert found["gyroscope"] is None
-    assert "record turns about x, y and z" in found["not_calibrated"]["gyroscope"]
+    assert "method=rests_and_moves calibrates it" in found["not_calibrated"]["gyroscope"]
     assert document(published, "validations", unit)["gyroscope"] is None
 
 

@@ -391,7 +391,7 @@ def next_face_or_turn(recordings: Sequence[Recording], procedure: Procedure, dwe
         return False, [*lines, f"next: {lacking} up; rest it for {dwell:g} s"]
     about = next((axis for axis, held in turns.items() if not (any(held) if judged else held)), None)
     if about is None:
-        return True, [*lines, "enough: all faces and turns are there"]
+        return True, [*lines, "enough for bias and matrix: all faces and turns are there"]
     back = "back " if len(turns[about]) % 2 else ""
     move = f"turn it {back}by {angle:g} deg about the vertical"
     return False, [*lines, f"next: +{about} up; rest it for {dwell:g} s, {move}, rest it for {dwell:g} s again"]

@@ -287,6 +287,9 @@ def _wanted(document: JSON, stated: Certificate) -> Iterator[tuple[str, str, str
         "certificate.environment": stated.environment or measured,
         "serial in units.csv": document["administrativeData"]["items"][0]["identifications"][0]["value"],
     }
+    issued, performed = core["issueDate"], core["endPerformanceDate"]
+    if issued and performed and str(issued) < str(performed):
+        yield "date of issue after the calibration", "7.8.2.1 j", "certificate.issued", None
     for what, clause, key in ASKED:
         yield what, clause, key, known[key] if key in known else attrgetter(key.partition(".")[2])(stated)
     if any(r["name"] == "accelerometer" for r in results):

@@ -58,7 +58,7 @@ NEXT = tuple(
 MOVES = "gyroscope_moves_over_noise"
 SUMMARY_COLUMNS = (
     *UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, *OF_UNIT, *NEXT,
-    MOVES,
+    MOVES, "state",
 )  # fmt: skip
 PARAMETER_KEYS = ("sensor", "parameter", "label", "measure", "value", "u", "U", "limit", "beyond", "fitted")
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated

@@ -42,6 +42,7 @@ from pipeline.core.records import (
     Values,
 )
 from pipeline.core.settings import DataSheet, Table
+from pipeline.core.verdicts import Verdict
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW, min_delta_bic
 from pipeline.estimation.posterior import prior_limit
 from pipeline.evaluation.diagnosis.words import plain
@@ -356,6 +357,8 @@ def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:
     ``share`` is None where the sensor file has no limit; the largest come first. ``excluded``: whether the recordings
     exclude an effect of the size of that limit, and no answer of the answer set contains it.
     """
+    if found.get("verdict") == Verdict.UNEXPLAINED:  # a model that does not explain the residual limits nothing
+        return []
     rows, open_effects = [], {name for answer in found.get("answer_set") or [] for name in answer["effects"]}
     known = catalogue()
     for name, limits in (found.get("upper_limit") or {}).items():
