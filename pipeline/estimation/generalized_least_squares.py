@@ -299,12 +299,14 @@ def _fit_best(
         design = design_at(observations, _with_all_columns(start, terms))
         return _solve(design, observations, settings).log_likelihood
 
-    chosen = combinations[0] if len(combinations) == 1 else max(combinations, key=likelihood)
-    timing = [term for term in chosen if term.effect.moves and not np.any(term.values)]
-    if timing and len(timing) < len(chosen):
+    timing = [term for term in combinations[0] if term.effect.moves and not np.any(term.values)]
+    if timing and len(timing) < len(combinations[0]):  # they move the rows, and so change the likelihood of the starts
         start = fit_terms(observations, timing, start, settings)
         fitted = {term.effect.name: term.values for term in start.terms}
-        chosen = [replace(term, values=fitted.get(term.effect.name, term.values)) for term in chosen]
+        combinations = [
+            [replace(term, values=fitted.get(term.effect.name, term.values)) for term in each] for each in combinations
+        ]
+    chosen = combinations[0] if len(combinations) == 1 else max(combinations, key=likelihood)
     return fit_terms(observations, chosen, start, settings)
 
 

@@ -11,6 +11,8 @@ from bench_session import BIAS, CONTINUOUS, ONE_WAY, SIZE, STOP_AND_GO, THESIS, 
 from scipy.special import stdtrit
 from unit_settings import settings_of, with_noise
 
+from imu_research.study.cases import draw
+from imu_research.study.run import judge
 from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.core.records import SensorCalibration
 from pipeline.estimation.design import EffectColumns, ordinary_base
@@ -220,3 +222,10 @@ def test_a_lever_arm_leaves_nothing_at_the_corners_of_a_ramp() -> None:
         reading = observations.reading[row : row + len(model)]
         row += len(model)
         assert np.abs(reading - model).max() < 1e-9
+
+
+def test_effects_of_timing_are_fitted_before_the_start_of_a_time_constant_is_chosen() -> None:
+    """With a wrong clock, the likeliest start of a warm-up did not converge: what was offered was refused."""
+    (result,) = judge(draw("pairs", 89, 6203))
+    assert result["selected"] == ["clock_rate", "warm_up"]
+    assert result["held_out"]["after"] < 1.1 * result["held_out"]["floor"]
