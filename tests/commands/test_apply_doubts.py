@@ -68,6 +68,26 @@ def test_a_good_log_is_not_doubted(calibration: Path, capsys: pytest.CaptureFixt
         assert warnings(calibration, readings(), capsys, digits) == []
 
 
+def test_a_sensor_that_is_not_ready_by_the_diagnosis_beside_its_calibration_is_named(
+    calibration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = calibration.parent / "results"
+    for folder in ("calibrations", "diagnoses"):
+        (results / folder).mkdir(parents=True)
+    published = results / "calibrations" / "U1.json"
+    published.write_bytes(calibration.read_bytes())
+    assert warnings(published, readings(), capsys) == []
+    parts = {
+        "accelerometer": {"verdict": "unexplained", "selected": [], "decided_by": "misfit of the fit, 31 x noise"},
+        "gyroscope": {"verdict": "missing_effect", "selected": ["g_sensitivity"]},
+    }
+    (results / "diagnoses" / "U1.json").write_text(json.dumps(parts))
+    assert warnings(published, readings(), capsys) == [
+        "warning: the accelerometer is not ready: unexplained, misfit of the fit, 31 x noise",
+        "warning: the gyroscope is not ready: effect missing, g_sensitivity",
+    ]
+
+
 def test_a_log_that_this_command_made_is_known_again(calibration: Path, capsys: pytest.CaptureFixture[str]) -> None:
     warnings(calibration, readings(), capsys)
     out = calibration.parent / "out.csv"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,9 @@ from pipeline.app.field_logs.stream import LogProfile, compensate_log, require_a
 from pipeline.app.run_progress import Countdown
 from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.files import CONFIGS
+from pipeline.core.pack import is_published, read_published
+from pipeline.core.records import SENSORS
+from pipeline.core.verdicts import DOUBTS, KINDS, Verdict
 from pipeline.physics.compensation import SMOOTHING_S, load, read_calibration
 
 if TYPE_CHECKING:
@@ -67,13 +71,27 @@ def main(argv: Sequence[str]) -> int:
         progress=lambda rows, read: countdown(read, f"{rows} samples"),
     )  # fmt: skip
     countdown.end()
-    for warning in result.warnings:
+    for warning in [*_not_ready(arguments.calibration), *result.warnings]:
         print(f"warning: {warning}", file=sys.stderr)
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
     what = f"messages compensated on {result.topic}" if result.topic else "rows compensated"
     print(f"{result.samples} {what} with unit {result.unit}: {arguments.output}", file=sys.stderr)
     return 0
+
+
+def _not_ready(calibration: Path) -> list[str]:
+    """Return which sensors of a published calibration are not ready, by the diagnosis beside it."""
+    file = calibration.parent.parent / "diagnoses" / calibration.name
+    if calibration.parent.name != "calibrations" or not is_published(file):
+        return []
+    document, found = json.loads(read_published(file)), []
+    for sensor in SENSORS:
+        part = document.get(sensor) or {}
+        if part.get("verdict") in DOUBTS | {Verdict.MISSING_EFFECT}:
+            words = ", ".join(part["selected"]) or part.get("decided_by") or ""
+            found.append(f"the {sensor} is not ready: {KINDS[part['verdict']].name}{', ' * bool(words)}{words}")
+    return found
 
 
 def _parser() -> argparse.ArgumentParser:
