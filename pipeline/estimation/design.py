@@ -58,6 +58,7 @@ from pipeline.physics.effects.base import (
     truth,
     unit_of,
 )
+from pipeline.physics.effects.formula_effect import FormulaEffect
 
 REMEMBERED = 4  # motions of a part after effects of timing: of the base, and of terms without their own effect
 # singular value of unit columns that is determined; share of its vector
@@ -98,7 +99,9 @@ class EffectColumns:
     def key(self) -> tuple[Hashable, ...]:
         """What the columns and the prior follow from, for the observations of one unit."""
         prior = self.prior and (self.prior.mean.tobytes(), self.prior.precision.tobytes())
-        return self.effect, self.values.tobytes(), self.full, prior  # two formulas of a search may have one name
+        # two formulas of a search may have one name
+        what = self.effect if isinstance(self.effect, FormulaEffect) else self.effect.name
+        return what, self.values.tobytes(), self.full, prior
 
     def layout(self) -> Layout:
         """Return the layout of the effect's columns."""

@@ -45,8 +45,9 @@ from pipeline.core.records import (
 from pipeline.ingest.axis_maps import STRAIGHT, axis_maps, axis_matrix, in_body_axes, map_of_orientation
 from pipeline.ingest.clock_alignment import unwrapped
 from pipeline.ingest.disturbances import leave_out_disturbances, leave_out_shaken_rests
-from pipeline.ingest.files import candidate_files, require_recordings
+from pipeline.ingest.files import candidate_files
 from pipeline.ingest.quality_flags import examine
+from pipeline.ingest.recordings_sheet import require_recordings
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
