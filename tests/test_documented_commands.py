@@ -138,7 +138,8 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(command: str, directory: Path) -> subprocess.CompletedProcess[str]:
     python = Path(sys.executable).parent
     paths = {"PATH": f"{python}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(directory)}
-    command = re.sub(r"(?<![\w.])/(tmp|data)/", f"{directory}/\\1/", command).replace("NAME", "quadratic_nonlinearity")
+    command = re.sub(r"(?<![\w.])/(tmp|data)/", f"{directory}/\\1/", command)
+    command = command.replace("SENSOR.NAME", "accelerometer.NAME").replace("NAME", "quadratic_nonlinearity")
     environment = os.environ | paths | {"PYTHONWARNINGS": "", "NO_COLOR": "1"}
     return subprocess.run(
         ["bash", "-e", "-c", command],
