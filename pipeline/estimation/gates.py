@@ -9,7 +9,10 @@ alone: wander of the bias that the noise model does not describe has a similar s
 False selections (docs/evidence.md, measures ``nothing_by_hand``, ``nothing_on_tables``): of 2,000 units by hand with
 nothing hidden, 5 gain more than 16 by a slow effect, 3 more than 20, and 1 more than 22 (0.05 %, 95 % interval 0.001 to
 0.28 %), all five with five times the stated wander or a random walk; no other effect gains more than 6. Of 1,994
-units on tables 2 gain more than 16, none more than 20 (0 to 0.18 %), and no other effect more than 6.
+units on tables (3cbfaf00) 2 gain more than 16, none more than 20 (0 to 0.18 %), and no other effect more than 6.
+
+On a table, effects below their gate join the selected ones where the set of all is ``MIN_ANSWER_PROBABILITY`` probable
+(``pipeline.estimation.posterior.completed``).
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ MIN_DELTA_BIC = 10.0  # "very strong" evidence (Raftery, Sociological Methodolog
 MIN_DELTA_BIC_OF_SLOW = 22.0  # of a slow effect, see above
 MAX_MIN_DELTA_BIC = 30.0  # largest delta BIC that is required after effects with a large gain
 ERROR_OF_FIRST_ORDER = 2e-4  # of the gain in 2 log L of effects: the error of their equations of first order
+MIN_ANSWER_PROBABILITY = 0.9  # nothing was selected in 1,996 sensors without an effect (e8e84f42)
 MAX_FALSE_PROBABILITY = 0.01  # of a false selection by chance, over all candidates
 TIMES_POSSIBLE = 3.0  # times the sensor file's limit: a parameter beyond, by its 95 % interval, is not possible
 MAX_FALSE_DEPENDENCE = 1e-3  # probability that a complete model seems to depend on a covariate, over all tests

@@ -42,6 +42,7 @@ from pipeline.estimation.evidence import (
     linear_problem,
     log_sum,
 )
+from pipeline.estimation.gates import MIN_ANSWER_PROBABILITY
 from pipeline.estimation.gauss_markov import WHITE_SETTING, random_walks
 from pipeline.estimation.generalized_least_squares import JointFit, design_at, fit_terms
 from pipeline.estimation.ranking import MIN_NEW_COLUMN_SHARE, without
@@ -64,7 +65,6 @@ EXTENDED_LOG_EVIDENCE = 7.0
 # number of these sets; iterations of the search for the best scales, and of exchanges
 MOST_NEAR, SCALE_SEARCH_ITERATIONS = 16, 3
 CERTAIN = 0.97  # largest stated probability: of the inclusions with 1.000, 96.6 % were right in those sensors
-SURE = 0.9  # least probability of an answer whose further effects are selected, see ``completed``
 ANSWER_SET_PROBABILITY = 0.95  # probability of an answer set
 UPPER_LIMIT_SHARE = 29.0 / 30.0  # of an upper limit, see above
 LIMIT_SET_SHARE = 0.05  # share of the best probability, above which a set is used for upper limits
@@ -348,7 +348,7 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
 
 
 def completed(selection: Selection, hidden: Callable[[Selection], Collection[str]]) -> Selection:
-    """Return a selection with the other effects of its most probable answer, if that is ``SURE`` and has all selected.
+    """Return a selection with the other effects of its most probable answer, if it has all selected and is sure enough.
 
     ``hidden`` returns the effects that the recordings cannot show. A gate asks of each effect what rules out chance
     among all candidates; where the size of an effect is known well (Earth's rotation), or beside effects that are
@@ -360,7 +360,7 @@ def completed(selection: Selection, hidden: Callable[[Selection], Collection[str
     curves = curves_of(selection) if selection.names else ()
     names, probability = posterior(selection, hidden(selection), curves).sets[0]
     more = [name for name in names if name not in selection.names]
-    whole = probability >= SURE and len(names) == len(selection.names) + len(more)
+    whole = probability >= MIN_ANSWER_PROBABILITY and len(names) == len(selection.names) + len(more)
     slow = any(name in catalogue() and effect(name).of_the_room(selection.observations.sensor) for name in more)
     return selection.with_more(more) if more and whole and (selection.names or not slow) else selection
 
