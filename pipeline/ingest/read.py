@@ -58,6 +58,7 @@ if TYPE_CHECKING:
 
 
 MAX_NAMED_FILES = 5  # further files that an error lists
+SAME_DIRECTION = 0.01  # rad: rows of attitudes differ by more, samples of a rest or of movement by less
 IN_MEMORY = "(DataFrame)"  # after the name of a recording that has no file
 LABEL = "label"
 AVERAGED_S = 1.0  # shorter than anyone averages by hand: the noise is then rather too large
@@ -310,6 +311,16 @@ def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, che
     table = replace(table, time_ns=np.rint(time * 1e9).astype(np.int64), notes=notes)
     if not starts.all():
         return table
+    if all(channel in table.values for channel in TRIADS["accelerometer"]):
+        u = np.column_stack([table.values[channel] for channel in TRIADS["accelerometer"]])
+        step = np.linalg.norm(np.diff(u / np.linalg.norm(u, axis=1, keepdims=True), axis=0), axis=1)
+        if len(step) and np.median(step) < SAME_DIRECTION:
+            message = (
+                f"kind attitudes takes each row as another attitude, but gravity turns by "
+                f"{np.degrees(np.median(step)):.2g} deg (median) from row to row: state in recordings.csv that it is "
+                f"rest, moves or slow, or add a column {LABEL} with one text for all samples of an attitude"
+            )
+            raise IngestError(message, str(path), code="sheet")
     noise = {name: sensor.of(name).noise_density * float(np.sqrt(0.5 / AVERAGED_S)) for name in SENSORS}
     return replace(table, source={**table.source, NOISE_OF_ROWS: noise})
 

@@ -276,7 +276,8 @@ class GyroscopeModel:
         if not about.any() and not r.any():
             return None
         rounding = np.einsum("ic,jd,cd->icjd", r / error, r / error, np.eye(3)).reshape(error.size, -1)
-        u = self.force / np.linalg.norm(self.force, axis=1, keepdims=True)
+        length = np.linalg.norm(self.force, axis=1, keepdims=True)
+        u = self.force / np.where(length > 0.0, length, 1.0)  # zero without an accelerometer, which alone shows creep
         upward = u[:, :, None] * u[:, None, :]
         rate = across[:, None, None] ** 2 * (np.eye(3) - upward) + about[:, None, None] ** 2 * upward
         creep = scipy.linalg.block_diag(*(K @ rate @ K.T / error[:, :, None] / error[:, None, :]))

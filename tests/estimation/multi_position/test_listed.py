@@ -304,6 +304,30 @@ def test_blocks_of_rows_with_a_label_are_attitudes(tmp_path: Path) -> None:
     assert np.abs(errors(unit, found, "accelerometer")).max() < 1.2
 
 
+def test_samples_of_one_attitude_are_no_attitudes(tmp_path: Path) -> None:
+    unit = Unit(tmp_path, np.random.default_rng(8))
+    unit.write("still", "attitudes,,,,", *at_rest(9.0, np.array([0.0, 0.6, 0.8])), "a")
+    unit.sheet()
+    with pytest.raises(InputError, match="gravity turns by 0") as refused:
+        calibrated(tmp_path)
+    assert "still.csv" in str(refused.value)
+
+
+def test_an_axis_that_stops_for_a_while_is_no_internal_error_without_an_accelerometer(tmp_path: Path) -> None:
+    unit, up = Unit(tmp_path, np.random.default_rng(8)), np.array([0.0, 0.0, 1.0])
+    unit.write("still", "rest,,,,", *at_rest(20.0, up), "g")
+    turns = [joined(at_rest(4.0, up), turned(360.0, 90.0, e, up), at_rest(4.0, up)) for e in np.eye(3)]
+    for axis, turn in zip("xyz", turns, strict=True):
+        unit.write(f"turn_{axis}", f"turn,{axis},360,0.05,", *turn, "g")
+    unit.sheet()
+    lines = (tmp_path / "still.csv").read_text().splitlines()
+    held = lines[1].rpartition(",")[2]
+    lines[1:900] = [f"{line.rpartition(',')[0]},{held}" for line in lines[1:900]]
+    (tmp_path / "still.csv").write_text("\n".join(lines) + "\n")
+    found = calibrated(tmp_path).calibration["gyroscope"]
+    assert np.isfinite(found["bias"]).all()
+
+
 def test_a_long_soak_determines_the_bias_at_low_frequencies(tmp_path: Path) -> None:
     rng, rate, n, tau = np.random.default_rng(8), 2.0, 10800, 100.0
     keep, white = np.exp(-1.0 / (rate * tau)), 5e-3 * np.sqrt(rate / 2.0)
