@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from all_ways import single_ways
-from judged import RIGHT, SILENT, judge
+from judged import DOUBTFUL, REFUSED, RIGHT, SILENT, judge
 from run import drawn, run
+from sheets import judged_unit
 from unit_copy import Copy, NotApplicableError, Truth
 from ways_of_benches import exchanged_files
 from whole_run import run_campaign
@@ -35,6 +36,13 @@ def test_a_tenth_of_the_ways_leaves_no_silent_error_and_good_units_right(tmp_pat
     assert len({j.kind for j in judgements}) == len(TENTH) + 1
     assert [j.line for j in judgements if j.outcome == SILENT] == []
     assert {j.outcome for j in judgements if j.unit.startswith("good")} == {RIGHT}
+
+
+@pytest.mark.parametrize(
+    ("number", "outcomes"), [(4, [REFUSED]), (10, [REFUSED]), (8, [DOUBTFUL, DOUBTFUL]), (19, [RIGHT])]
+)
+def test_corrupted_sheets_leave_no_silent_error(number: int, outcomes: list[str]) -> None:
+    assert [outcome for outcome, _ in judged_unit(number, 3)] == outcomes
 
 
 def test_there_are_at_least_150_ways() -> None:
