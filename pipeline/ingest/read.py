@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 
 MAX_NAMED_FILES = 5  # further files that an error lists
-SAME_DIRECTION = 0.01  # rad: rows of attitudes differ by more, samples of a rest or of movement by less
+LEAST_TURN_OF_ROWS = 0.01  # rad: rows of attitudes differ by more, samples of a rest or of movement by less
 IN_MEMORY = "(DataFrame)"  # after the name of a recording that has no file
 LABEL = "label"
 AVERAGED_S = 1.0  # shorter than anyone averages by hand: the noise is then rather too large
@@ -314,7 +314,7 @@ def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, che
     if all(channel in table.values for channel in TRIADS["accelerometer"]):
         u = np.column_stack([table.values[channel] for channel in TRIADS["accelerometer"]])
         step = np.linalg.norm(np.diff(u / np.linalg.norm(u, axis=1, keepdims=True), axis=0), axis=1)
-        if len(step) and np.median(step) < SAME_DIRECTION:
+        if len(step) and np.median(step) < LEAST_TURN_OF_ROWS:
             message = (
                 f"kind attitudes takes each row as another attitude, but gravity turns by "
                 f"{np.degrees(np.median(step)):.2g} deg (median) from row to row: state in recordings.csv that it is "
