@@ -35,7 +35,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 from itertools import groupby, pairwise, product
 from typing import Any, TypeVar
 
@@ -43,7 +43,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from pipeline.core.errors import InputError, NotObservableError
-from pipeline.core.records import BASE_COUNT, MATRIX_ROWS, Index, Motion, Noise, Values, motion_at_rest
+from pipeline.core.records import BASE_COUNT, DEFERRED, MATRIX_ROWS, Index, Motion, Noise, Values, motion_at_rest
 from pipeline.estimation.engine import LinearMap, ScaledColumns, scaled_inverse
 from pipeline.estimation.gauss_markov import Products, Setting
 from pipeline.estimation.observations import Observations, RecordingRows, without_rows
@@ -165,16 +165,19 @@ def motions_of(part: RecordingRows, terms: Sequence[EffectColumns]) -> list[Moti
 def joined_motions(motions: Sequence[Motion]) -> list[tuple[Motion, list[Motion]]]:
     """Return the motions of successive recordings that hold the same signals as one, each with those that it joins."""
     joined = []
-    for held, group in groupby(
-        motions, lambda motion: [name for name in MOTION_FIELDS if getattr(motion, name) is not None]
-    ):
+    for held, group in groupby(motions, lambda motion: [name for name in MOTION_FIELDS if motion.has(name)]):
         members = list(group)
         if "direction" not in held:  # it is computed from the whole motion
             joined += [(each, [each]) for each in members]
             continue
-        signals: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in members]) for name in held}
-        joined.append((replace(motion_at_rest(signals["time"]), **signals), members))
+        signals: dict[str, Any] = {name: partial(_joined, members, name) for name in held}
+        now = {name: signals[name]() for name in held if name not in DEFERRED}
+        joined.append((motion_at_rest(now["time"]).changed(**signals | now), members))
     return joined
+
+
+def _joined(motions: Sequence[Motion], name: str) -> Values:
+    return np.concatenate([getattr(motion, name) for motion in motions])
 
 
 def columns_of_samples(

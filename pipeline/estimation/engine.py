@@ -279,16 +279,22 @@ class ResidualNoise:
         return [products[id(A)] for A in fit.weights]
 
 
-def assess_noise(
-    residuals: Values, design: Values, blocks: Blocks, prior: WanderPrior, disturbance: Values | None = None
+def assess_noise(  # noqa: PLR0917  (what a fit is)
+    residuals: Values,
+    design: Values,
+    blocks: Blocks,
+    prior: WanderPrior,
+    disturbance: Values | None = None,
+    row_weight: Values | None = None,
 ) -> ResidualNoise:
-    """Weight the hypotheses of a prior by the residuals of a fit, one sample a row.
+    """Weight the hypotheses of a prior by the residuals of a fit.
 
     If the stated accuracies of the table are worse than the noise, the residuals contain errors of the table, which
     have separate lines in the budget. The directions in which these errors exceed white noise are then projected out
     of all channels.
 
-    ``residuals``: (n, 3). ``design``: (n, p), the fitted columns of all channels. ``disturbance``: (3 m, r), channel by
+    ``residuals``: (n, 3), of samples. ``design``: (k, p), the fitted columns of all channels. ``row_weight``: (k,),
+    samples of each row of the design, one after the other; None: one. ``disturbance``: (3 m, r), channel by
     channel: change of the sums over the blocks by r independent errors of the table, each of standard uncertainty 1.
     Raises ``NotObservableError`` if there are no more samples than parameters.
     """
@@ -299,21 +305,23 @@ def assess_noise(
             f"{len(count)} samples determine {design.shape[1]} parameters and leave none to determine the noise: "
             "record more samples"
         )
-    size = np.sqrt(np.mean(design**2, axis=0))
-    scaled = np.sqrt(count) * (blocks.sums(design) / count / np.where(size > 0, size, 1.0))
-    means = blocks.sums(residuals) / count
+    weight = np.ones(len(design)) if row_weight is None else row_weight
+    size = np.sqrt(weight @ design**2 / weight.sum())
+    scaled = np.sqrt(count) * (blocks.sums(weight[:, None] * design) / count / np.where(size > 0, size, 1.0))
+    first = blocks.first if row_weight is None else np.rint(np.cumsum(blocks.weight) - blocks.weight).astype(np.intp)
+    means = np.add.reduceat(residuals, first, axis=0) / count
     if disturbance is not None:
         white = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
         settings = prior.grid(float(np.sqrt(np.mean(white**2))))
         columns = np.asarray(np.kron(np.eye(3), scaled).reshape(3, len(count), -1), np.float64)
-        return noise_outside_known_errors(columns, means, blocks, settings, white, disturbance)
+        return noise_outside_known_errors(columns, means, blocks, settings, white, disturbance, row_weight)
     U, s, _ = np.linalg.svd(scaled, full_matrices=False)
     basis = U[:, s > AVERAGED_OUT * s[0]]
     settings = prior.grid(float(np.sqrt(np.mean(residuals**2))))
     logarithm, squares = GaussMarkov(blocks, settings).restricted(basis / np.sqrt(count), means)
     free = len(count) - basis.shape[1]
     variance = np.maximum(squares / free, np.finfo(float).tiny)
-    return replace(ResidualNoise.of(blocks, settings, 3.0 * logarithm, variance, free), spare=spare)
+    return replace(ResidualNoise.of(blocks, settings, 3.0 * logarithm, variance, free, row_weight), spare=spare)
 
 
 def noise_outside_known_errors(  # noqa: PLR0917  (what a restricted likelihood without known errors is)

@@ -298,7 +298,7 @@ def _motion_at(recording: Recording, motion: Motion, rows: RowGroups) -> Motion:
 
 
 def _with_direction(motion: Motion) -> Motion:
-    return replace(motion, direction=turning_direction(motion))
+    return motion.changed(direction=partial(turning_direction, motion))
 
 
 def filtered_motion(motion: Motion, recording: Recording) -> Motion:

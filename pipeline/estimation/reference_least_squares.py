@@ -11,7 +11,8 @@ where
     b : (3,) bias
     K : (3, 3)
 
-each channel is a linear problem with the same columns (1, u_x, u_y, u_z). A filtered reading is compared with
+each channel is a linear problem with the same columns (1, u_x, u_y, u_z), fitted to the means of samples between which
+the motion changes little (``pipeline.estimation.turns.rows_of_parts``). A filtered reading is compared with
 ``b + K F u``, F the same filter. This is exact for any linear filter; a shift of u by the filter's delay would ignore
 its attenuation and be wrong in every ramp. Only if the filter cannot be reproduced, the shift ``u(t - delay)`` is used.
 
@@ -35,8 +36,8 @@ from pipeline.estimation.engine import LinearMap, ScaledColumns, linear_converge
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.stages import FitStage, StageInput, details_on_table
-from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, settled, used_motions
+from pipeline.estimation.table_errors import Reference, noise_on_table
+from pipeline.estimation.turns import TurnPart, parts_of, rows_of_parts, settled
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
 from pipeline.physics.effects import stated_priors
 from pipeline.physics.effects.base import truth
@@ -57,25 +58,32 @@ def fit(task: StageInput) -> SensorCalibration:
     """Fit bias and matrix of a sensor against the table's motion (``pipeline.estimation.stages``); role: the sensor."""
     sensor, recordings, settings, prior = task.sensor, task.recordings, task.settings, task.prior
     parts = [_select(sensor, part) for part in parts_of(recordings.filtered, sensor, settings.table, NAME)]
-    y = np.concatenate([part.reading(sensor) for part in parts])
-    u = np.concatenate([_reference(sensor, part)[part.keep] for part in parts])
+    readings = np.concatenate([part.reading(sensor) for part in parts])
+    truths = np.concatenate([_reference(sensor, part)[part.keep] for part in parts])
+    if not truths.any():
+        raise NotObservableError(f"{sensor}: the table never moved in these recordings; {ADVICE[sensor]}")
+    rows, blocks = rows_of_parts(parts)
+    count = np.concatenate([each.count for each in rows])
+    first, root = (np.cumsum(count) - count).astype(np.intp), np.sqrt(count)[:, None]
+    y, u = (np.add.reduceat(of_samples, first, axis=0) / count[:, None] for of_samples in (readings, truths))
     X = np.column_stack([np.ones(len(u)), u])
-    condition, rank = _require_observable(sensor, X), X.shape[1]
-    factors = ScaledColumns.of(X)
-    beta = factors.solve(y)
-    residuals = y - X @ beta
+    condition, rank = _require_observable(sensor, X, root), X.shape[1]
+    factors = ScaledColumns.of(root * X)
+    beta = factors.solve(root * y)
+    residuals = readings - beta[0] - truths @ beta[1:]
     bias, K = beta[0], beta[1:].T
     matrix = np.asarray(np.linalg.solve(K, np.eye(3)), float)
     J = np.zeros((3, BASE_COUNT, 4))
     for channel in range(3):
         J[channel, channel, 0] = 1.0
         J[channel, MATRIX, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
-    weights = factors.weights()
+    weights = factors.weights() * root.T
     fit = LinearMap((weights, weights, weights), (J[0], J[1], J[2]))
-    reference = Reference(sensor, used_motions(parts), K, settings.table)
-    noise = noise_of_fit(parts, reference, residuals, X, prior)
+    motions = [each.motion(part.motion) for each, part in zip(rows, parts, strict=True) if len(each.count)]
+    reference = Reference(sensor, motions, K, settings.table)
+    noise = noise_on_table(reference, residuals, X, blocks, prior, count)
     contributions = [noise_contribution(noise, fit, prior)]
-    details = details_on_table(noise, contributions[0].degrees_of_freedom, parts, len(y), condition)
+    details = details_on_table(noise, contributions[0].degrees_of_freedom, parts, len(readings), condition)
     result = StageResult(
         name=NAME,
         parameters=base_parameters(sensor, bias, matrix, contributions[0].covariance),
@@ -87,7 +95,7 @@ def fit(task: StageInput) -> SensorCalibration:
         bias=bias,
         matrix=matrix,
         stages=(*task.stages, result),
-        convergence=linear_convergence(X, residuals, condition, rank),
+        convergence=linear_convergence(root * X, root * (y - X @ beta), condition, rank),
     )
 
     def results(errors: Values) -> Values:
@@ -127,12 +135,13 @@ def _reference(sensor: str, part: TurnPart) -> Values:
         return truth(sensor, late or motion)
 
 
-def _require_observable(sensor: str, X: Values) -> float:
-    """Return the condition of the columns, in units of the largest motion; raise if one is not determined."""
-    size = float(np.max(np.linalg.norm(X[:, 1:], axis=1), initial=0.0))
-    if size == 0.0:
-        raise NotObservableError(f"{sensor}: the table never moved in these recordings; {ADVICE[sensor]}")
-    scaled = X / np.array([1.0, size, size, size]) / np.sqrt(len(X))
+def _require_observable(sensor: str, X: Values, root: Values) -> float:
+    """Return the condition of the columns, in units of the largest motion; raise if one is not determined.
+
+    ``root``: (n, 1), of the samples of each row.
+    """
+    size = float(np.max(np.linalg.norm(X[:, 1:], axis=1)))
+    scaled = root * X / np.array([1.0, size, size, size]) / np.linalg.norm(root)
     _, s, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
     singular = np.zeros(4)
     singular[: len(s)] = s

@@ -169,25 +169,31 @@ def disturbance(
 ) -> Values | None:
     """Return the change of sums over blocks by the errors of the table, or None if it is small against the noise.
 
-    ``residuals``: (n, 3). ``weight``: (n,), samples of each row; None: rows are samples. ``white``: (3,), noise of a
-    sample; None: from the residuals. Returns F, (3 m, r), channel by channel, for r independent errors of standard
-    uncertainty 1: the sums have the covariance ``F F^T``.
+    ``residuals``: (n, 3). ``weight``: (k,), samples of each row; None: rows are samples. ``white``: (3,), noise of a
+    sample; None: from the residuals, then those of samples. Returns F, (3 m, r), channel by channel, for r independent
+    errors of standard uncertainty 1: the sums have the covariance ``F F^T``.
     """
     if white is None:
         white = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
     if not 0.0 < white.min() < _largest(reference) * np.sqrt(blocks.weight.max()):
         return None
-    rows = len(residuals)
-    sums = BlockSums(blocks.label(rows), len(blocks.weight), np.ones(rows) if weight is None else weight)
+    weight = np.ones(len(residuals)) if weight is None else weight
+    sums = BlockSums(blocks.label(len(weight)), len(blocks.weight), weight)
     stated, _ = _stated_errors(reference, sums)
     return np.column_stack([u * _without_rounding(effect) for _, u, _, effect in stated]) if stated else None
 
 
-def noise_on_table(
-    reference: Reference, residuals: Values, design: Values, blocks: Blocks, prior: WanderPrior
+def noise_on_table(  # noqa: PLR0917  (as of ``assess_noise``)
+    reference: Reference,
+    residuals: Values,
+    design: Values,
+    blocks: Blocks,
+    prior: WanderPrior,
+    row_weight: Values | None = None,
 ) -> ResidualNoise:
     """Weight the hypotheses of a prior by the residuals of a fit on a table; arguments: see ``assess_noise``."""
-    return assess_noise(residuals, design, blocks, prior, disturbance(reference, residuals, blocks))
+    known = disturbance(reference, residuals, blocks, row_weight)
+    return assess_noise(residuals, design, blocks, prior, known, row_weight)
 
 
 def _largest(reference: Reference) -> float:
@@ -223,7 +229,7 @@ def _angle(reference: Reference, fit: LinearMap | BlockSums) -> Values:
     """Return the change of the parameters by an error of each stop's angle: (p, stops) array."""
     before, after, stop, count = errors_of_stops(reference.sensor, reference.motions, reference.K)
     at_stops = fit.of_groups(before, stop, count + 1) + fit.of_groups(after, stop + 1, count + 1)
-    attitudes = [m for m in reference.motions if m.axis is None and m.level is not None]
+    attitudes = [m for m in reference.motions if m.axis is None and m.has("level")]
     return np.concatenate([at_stops, *(_turned(reference, fit, motion) for motion in attitudes)], axis=1)
 
 

@@ -178,7 +178,7 @@ def centred(motions: Sequence[Motion]) -> list[Motion]:
     """Return the motions with the mean temperature to which effects refer."""
     known = [motion.temperature for motion in motions if motion.temperature is not None]
     shift = REFERENCE_TEMPERATURE - float(np.mean(np.concatenate(known))) if known else 0.0
-    return [m if m.temperature is None else replace(m, temperature=m.temperature + shift) for m in motions]
+    return [m if m.temperature is None else m.changed(temperature=m.temperature + shift) for m in motions]
 
 
 def changes_by_hand(
@@ -300,7 +300,7 @@ def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float, 
     step = 1.0 / counts_per_unit
     if np.all(noise.white >= DITHERED * step):
         return f"contained in the {NOISE_SOURCE}, which reach {float(noise.white.min()) / step:.1f} counts or more"
-    label = noise.blocks.label(int(noise.blocks.weight.sum()))
+    label = noise.blocks.label(fit.weights[0].shape[1])
     rough = np.where(noise.white < DITHERED * step, 1.0, 0.0) * np.ones((len(label), 3))
     effects = [fit.of_groups(rough * axis, label, len(noise.blocks.weight)) for axis in np.eye(3)]
     return type_b(QUANTISATION_SOURCE, RECTANGULAR, step / np.sqrt(12.0), unit, np.concatenate(effects, axis=1))
@@ -384,27 +384,24 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     contributions: Sequence[Contribution],
     settings: Settings,
     results: Callable[[Values], Values],
-    estimated: Sequence[str] = (),
+    estimated: Sequence[str] | None = None,
 ) -> SensorCalibration:
     """Return a calibration on a table with its budget and, if configured, a Monte Carlo run.
 
     ``contributions``: first that of the noise; the others act on the parameters directly. ``results``: function of
-    (t, q) errors of the fit's linear map, channel after channel, to (t, p) parameters. ``estimated``: effects of the
-    fit; an error that one of them estimates is no input.
+    (t, q) errors of the fit's linear map, channel after channel, to (t, p) parameters. ``estimated``: effects of a
+    joint fit, whose noise contains that of rounding; an error that one of them estimates is no input.
     """
-    sensor = calibration.sensor
+    sensor, joint, estimated = calibration.sensor, estimated is not None, estimated or ()
     counts = settings.sensor.of(sensor).counts_per_unit
     found, absent = table_errors(reference, fit, estimated)
     if TILT in estimated and tilt_like_zeros(reference.motions, estimated) is not None:
         absent["levelling"] = ACROSS
 
     def rounding(fit: LinearMap) -> Contribution | str:
-        of_samples = noise.row_weight is None
-        return (
-            _quantisation(noise, fit, counts, SENSOR_UNITS[sensor])
-            if of_samples
-            else f"contained in the {NOISE_SOURCE}"
-        )
+        if joint:
+            return f"contained in the {NOISE_SOURCE}"
+        return _quantisation(noise, fit, counts, SENSOR_UNITS[sensor])
 
     lines, missing, rounded = list(contributions), {"temperature": TEMPERATURE}, rounding(fit)
     if isinstance(rounded, str):

@@ -34,10 +34,9 @@ both ends, and the acceleration from the five nearest rates.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,8 +50,11 @@ from pipeline.core.records import (
     Values,
     conjugate_product,
     continuous,
+    cross,
+    level_in_body,
     median,
     once_of_log,
+    quintic_spline,
 )
 from pipeline.core.settings import Table
 from pipeline.physics.signal.encoder_rate import rate_by_angle, step_of
@@ -406,7 +408,7 @@ def _reference_motion(
     warm = recording.temperature is not None
     own_clock = "table" if "table_clock" in recording.source else "sensor"
     logged = partial(
-        replace,
+        Motion.changed,
         temperature=temperature_of(recording) if warm else None,
         temperature_rate=temperature_rate_of(recording) if warm else None,
         timed_by=own_clock if recording.table_rate is None else "",
@@ -443,27 +445,31 @@ def _motion_of_turn(
         moved = bool(np.any(offset))
         if rows is not None:
             angle, rate, acceleration, cosine, sine = log.means(rows, offset, lag)
-            level, known = turn_by(home, axis, cosine, -sine), log.known_in(rows, offset)
+            turned, known = partial(turn_by, axis=axis, cosine=cosine, sine=-sine), log.known_in(rows, offset)
         elif lag > 0.0:
             angle = log.angle_at(time + offset) if moved else log.angle
             rate, acceleration = log.lagged(time + offset, lag)
             past = np.radians([-log.angle_at(time + offset - lag * node) for node in NODES])
-            level = turn_by(home, axis, WEIGHTS @ np.cos(past), WEIGHTS @ np.sin(past))
+            turned = partial(turn_by, axis=axis, cosine=WEIGHTS @ np.cos(past), sine=WEIGHTS @ np.sin(past))
         else:
             angle, rate, acceleration = log.at(time + offset) if moved else (log.angle, log.rate, log.acceleration)
-            level = turn_about_axis(home, axis, -angle)
+            turned = partial(turn_about_axis, axis=axis, angle_deg=-angle)
         if rows is None:
             known = log.known_at(time + offset) if moved else log.valid_samples
-        force = gravity_g * level[:, 2, :]
-        omega, alpha = np.zeros_like(force), np.zeros_like(force)
-        omega[:, axis], alpha[:, axis] = rate, acceleration
+
+        def force() -> Values:
+            return gravity_g * turned(home[2])
+
+        deferred: dict[str, Any] = {
+            "specific_force": force,
+            "angular_rate": lambda: _along(axis, rate) + (0.0 if earth is None else earth_in_body(earth, turned(home))),
+            "angular_acceleration": lambda: _along(axis, acceleration),
+            "specific_force_rate": lambda: -np.radians(rate)[:, None] * (force() @ ABOUT[axis].T),
+            "level": partial(turned, home),
+        }
         return logged(
             Motion(
                 time=time,
-                specific_force=force,
-                angular_rate=omega if earth is None else omega + np.einsum("i,nij->nj", earth, level),
-                angular_acceleration=alpha,
-                specific_force_rate=-np.radians(rate)[:, None] * (force @ ABOUT[axis].T),
                 temperature=None,
                 angle=angle,
                 rate=rate,
@@ -471,12 +477,22 @@ def _motion_of_turn(
                 still=still,
                 at_offset=partial(at, offset, lag),
                 at_lag=partial(at, offset),
-                level=level,
                 reference_valid=known,
+                **deferred,
             )
         )
 
     return at(0.0)
+
+
+def _along(axis: int, values: Values) -> Values:
+    """Return vectors along a body axis: (n, 3) array."""
+    return np.asarray(values[:, None] * np.eye(3)[axis])
+
+
+def earth_in_body(earth: Values, level: Values) -> Values:
+    """Return Earth's rotation, (3,), in the body frame: (n, 3) array; ``level``: see ``Motion``."""
+    return np.asarray(np.einsum("i,nij->nj", earth, level))
 
 
 def level_at_zero(axis: int, up: str = "", shaft: int = 0) -> Values:
@@ -499,34 +515,34 @@ def level_at_zero(axis: int, up: str = "", shaft: int = 0) -> Values:
 def _motion_of_attitude(
     recording: Recording, gravity_g: float, earth: Values | None, logged: Callable[[Motion], Motion]
 ) -> Motion:
-    from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by attitude logs alone)
-
     assert recording.table_attitude is not None  # noqa: S101
     time, attitude = recording.time, continuous(recording.table_attitude)
     clock = recording.table_seconds
-    spline = make_interp_spline(time * clock, attitude, k=5)
+    spline = quintic_spline(time * clock, attitude)
 
     def at(before: float | Values, offset: float | Values = 0.0) -> Motion:
         offset = before + offset
         table_time = (time + offset) * clock
         q = spline(table_time) if np.any(offset) else attitude
-        level = attitude_matrix(q)
-        force = gravity_g * level[:, 2, :]
         omega = np.degrees(2.0 * conjugate_product(q, spline(table_time, 1)))
+
+        deferred: dict[str, Any] = {
+            "specific_force": lambda: gravity_g * level_in_body(q),
+            "angular_rate": lambda: omega if earth is None else omega + earth_in_body(earth, attitude_matrix(q)),
+            "angular_acceleration": lambda: np.degrees(2.0 * conjugate_product(q, spline(table_time, 2))),
+            "specific_force_rate": lambda: gravity_g * cross(level_in_body(q), np.radians(omega)),
+            "level": partial(attitude_matrix, q),
+        }
         return logged(
             Motion(
                 time=time,
-                specific_force=force,
-                angular_rate=omega if earth is None else omega + np.einsum("i,nij->nj", earth, level),
-                angular_acceleration=np.degrees(2.0 * conjugate_product(q, spline(table_time, 2))),
-                specific_force_rate=-np.cross(np.radians(omega), force),
                 temperature=None,
                 angle=None,
                 rate=None,
                 axis=None,
                 still=still_samples(time, np.linalg.norm(omega, axis=1)),
                 at_offset=partial(at, offset),
-                level=level,
+                **deferred,
             )
         )
 
@@ -574,5 +590,10 @@ def skew(v: Values) -> Values:
 
 def attitude_matrix(q: Values) -> Values:
     """Return the rotation matrices of unit quaternions: (n, 4) to (n, 3, 3), body vectors to level vectors."""
-    cross = skew(q[:, 1:])
-    return np.asarray(np.eye(3) + 2.0 * (q[:, :1, None] * cross + cross @ cross))
+    w, x, y, z = q.T
+    rows = (
+        *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        *(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        *(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return np.stack(rows, axis=1).reshape(-1, 3, 3)

@@ -53,6 +53,7 @@ from pipeline.physics.effects import effect
 DRIFT_TIME_S = 60.0  # s over which a drift is stated
 DRIFT_STARTS = 60  # starts over which a drift is averaged
 SHORTEST_DRIFT_S = 10.0  # s: a drift over a shorter time is mostly noise
+INTEGRATED = 50_000  # samples that are integrated at once
 CURVE_POINTS = 120  # points of the published curves
 # largest steps of the complementary filter, which integrates to first order
 MAX_FILTER_STEP_S, MAX_FILTER_STEP_DEG = 0.1, 5.0
@@ -96,7 +97,7 @@ def attitude(
         assert rate is not None  # noqa: S101
         alone = integrate(time, rate, reference[:, 0])
         drifts[name] = drift(time, alone, reference, seconds)
-        curve[f"drift_{name}"] = _rounded(angle_between(alone, reference)[shown])
+        curve[f"drift_{name}"] = _rounded(angle_between(alone[:, shown], reference[:, shown]))
         if tilts is not None:
             assert force is not None  # noqa: S101
             steps, fused = _fuse(time, force, alone)
@@ -111,16 +112,30 @@ def attitude(
 
 def integrate(time: Values, rate: Values, start: Values) -> Values:
     """Return the attitude by integration of angular rates, deg/s, from ``start`` on: unit quaternions (4, n)."""
-    w, dt = np.radians(rate), np.diff(time)[:, None]
-    mean = 0.5 * (w[:-1] + w[1:])
-    mean[1:-1] += (w[1:-2] + w[2:-1] - w[:-3] - w[3:]) / 24.0
-    turns = (dt * mean + dt**2 / 12.0 * cross(w[:-1], w[1:])).T
-    half = 0.5 * np.linalg.norm(turns, axis=0)
-    total, step = np.vstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * turns]), 1
-    total = np.column_stack([start, total])
-    while step < len(time):  # products of 2, 4, 8 ... neighbours: a running product in log2 n passes
-        total[:, step:] = _product(total[:, :-step], total[:, step:])
-        step *= 2
+    total, last = np.empty((4, len(time))), len(time) - 1
+    total[:, 0] = start
+    for first in range(0, last, INTEGRATED):  # in parts, which bounds the memory
+        stop = min(first + INTEGRATED, last)
+        before, dt = max(first - 1, 0), np.diff(time[first : stop + 1])[:, None]
+        w = np.radians(rate[before : stop + 2])
+        mean = 0.5 * (w[:-1] + w[1:])
+        mean[1:-1] += (w[1:-2] + w[2:-1] - w[:-3] - w[3:]) / 24.0
+        mean, w = mean[first - before :][: stop - first], w[first - before :][: stop - first + 1]
+        turns = (dt * mean + dt**2 / 12.0 * cross(w[:-1], w[1:])).T
+        half = 0.5 * np.linalg.norm(turns, axis=0)
+        each = np.vstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * turns])
+        total[:, first : stop + 1] = _running_product(np.column_stack([total[:, first], each]))
+    return total
+
+
+def _running_product(q: Values) -> Values:
+    """Return the product of each quaternion with all before it, (4, n), by that of the products of pairs."""
+    if q.shape[1] < 2:
+        return q
+    whole = _running_product(_product(q[:, :-1:2], q[:, 1::2]))  # up to every second
+    total = np.empty_like(q)
+    total[:, :1], total[:, 1::2] = q[:, :1], whole
+    total[:, 2::2] = _product(whole[:, : (q.shape[1] - 1) // 2], q[:, 2::2])
     return total
 
 
@@ -192,13 +207,14 @@ def _with_reference(recording: Recording) -> tuple[Recording, Values]:
     q = recording.table_attitude
     assert q is not None  # noqa: S101
     readings = [v for v in (recording.accelerometer, recording.gyroscope) if v is not None]
-    known, logged = np.isfinite(np.hstack(readings)).all(axis=1), np.isfinite(q).all(axis=1)
+    known, logged = np.all([np.isfinite(v).all(axis=1) for v in readings], axis=0), np.isfinite(q).all(axis=1)
     clock, q = recording.time[logged], q[logged]
     late = recording.time - float(recording.filter.get("delay_s", 0.0))
     known &= (late >= clock[:1].sum()) & bool(len(clock))
     if not known.any():
         return recording.select(known), np.zeros((0, 4))
-    return recording.select(known), np.stack([np.interp(late[known], clock, c) for c in continuous(q).T], 1)
+    logged_then = np.stack([np.interp(late[known], clock, c) for c in continuous(q).T], 1)
+    return recording if known.all() else recording.select(known), logged_then
 
 
 def _rounded(values: Values) -> list[float]:

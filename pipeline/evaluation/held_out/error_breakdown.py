@@ -70,7 +70,7 @@ from pipeline.estimation.selection import INFLATED
 from pipeline.estimation.uncertainty_budget import DITHERED, covariance_without_reference
 from pipeline.evaluation.held_out.samples import OTHER_SENSOR, Samples, mean_squares, reference_vector
 from pipeline.physics.effects import effect_of
-from pipeline.physics.effects.base import truth
+from pipeline.physics.effects.base import length, truth
 from pipeline.physics.effects.mounting import SEPARATOR, Mounting
 from pipeline.physics.measurement import LogEnd, SensorEffects, fields_used, inverse_of, linear_truth, log_motion, solve
 
@@ -143,10 +143,7 @@ def errors_of(calibrations: Sequence[SensorCalibration], samples: Sequence[Sampl
 
 def vector_errors(corrected: Sequence[Corrected], *, directed: bool) -> Values:
     """Return the errors of vectors, (n, 3), or, unless the direction is known, of their magnitudes, (n, 1)."""
-    parts = [
-        v - true if directed and true is not None else (np.linalg.norm(v, axis=1) - m)[:, None]
-        for v, m, true in corrected
-    ]
+    parts = [v - true if directed and true is not None else (length(v) - m)[:, None] for v, m, true in corrected]
     return np.asarray(np.concatenate(parts))
 
 
@@ -216,7 +213,7 @@ def _with_effects(calibration: SensorCalibration, effects: Sequence[FittedEffect
     motion = _moved(samples.motion, effects)
     rest = SensorEffects.of(calibration, of_reading).take_off(samples.reading, motion)
     moved, logged = truth(samples.sensor, motion), truth(samples.sensor, samples.motion)
-    change = np.linalg.norm(moved, axis=1) - np.linalg.norm(logged, axis=1)
+    change = length(moved) - length(logged)
     direction = moved if direction_known(calibration, samples) else None
     return linear_truth(calibration, rest), samples.magnitude + change, direction
 

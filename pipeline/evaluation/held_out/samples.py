@@ -33,9 +33,9 @@ import numpy as np
 from pipeline.estimation.gauss_markov import variance_of_average
 from pipeline.estimation.observations import filtered_motion
 from pipeline.estimation.rest_means import held_out_rests, rest_means, split_rests, variances_of_means
-from pipeline.physics.effects.base import truth
+from pipeline.physics.effects.base import length, truth
 from pipeline.physics.effects.equations import shifted
-from pipeline.physics.kinematics import earth_of, table_motion
+from pipeline.physics.kinematics import earth_in_body, earth_of, table_motion
 from pipeline.physics.measurement import linear_truth
 from pipeline.physics.signal.encoder_rate import MIN_RATE_SAMPLES, EncoderRate, rate_by_angle
 from pipeline.physics.signal.filters import filter_autocovariance, temperature_rate_of
@@ -233,7 +233,7 @@ def samples_of_motion(
         if by_angle is not None:
             white = white + by_angle.noise[:, None] ** 2
     if smoothed and motion is not None:
-        magnitude = np.linalg.norm(truth(sensor, motion), axis=1)
+        magnitude = length(truth(sensor, motion))
     squares = filter_autocovariance(recording) ** 2
     return Samples(
         sensor,
@@ -264,7 +264,7 @@ def reference_vector(calibration: SensorCalibration, samples: Samples) -> Values
     if samples.motion is not None:
         reference = truth(samples.sensor, samples.motion)
         direction = np.where(np.isfinite(reference).all(axis=1, keepdims=True), reference, reading)
-    size = np.linalg.norm(direction, axis=1, keepdims=True)
+    size = length(direction)[:, None]
     unit = np.where(size > 0, direction / np.where(size > 0, size, 1.0), [1.0, 0.0, 0.0])
     return np.asarray(samples.magnitude[:, None] * unit)
 
@@ -295,7 +295,7 @@ def _rate(
     """Return the magnitude of the rate that the gyroscope should measure: (n,) array, deg/s; None if it is unknown."""
     logged = recording.table_rate
     if motion is not None:
-        rate = np.linalg.norm(truth("gyroscope", motion), axis=1)
+        rate = length(truth("gyroscope", motion))
         if logged is None:
             return rate if by_angle is None else np.where(by_angle.vague, np.nan, rate)
     elif by_angle is not None:
@@ -308,7 +308,7 @@ def _rate(
         return np.abs(logged)
     of_table = rate
     if earth is not None and motion.level is not None:
-        of_table = np.linalg.norm(motion.angular_rate - np.einsum("i,nij->nj", earth, motion.level), axis=1)
+        of_table = np.linalg.norm(motion.angular_rate - earth_in_body(earth, motion.level), axis=1)
     return np.asarray(np.abs(logged) + (rate - of_table))
 
 
@@ -343,7 +343,7 @@ def squared_norm_errors(truth: Values, matrix: Values, variance: Values) -> Valu
 
 def mean_squares(truth: Values, S: Values) -> tuple[Values, Values]:
     """Return ``E(|t + x| - |t|)^2`` and its weight g, for (n, 3) truths and errors x of covariance S: (n,) arrays."""
-    size, total = np.linalg.norm(truth, axis=1), float(np.trace(S))
+    size, total = length(truth), float(np.trace(S))
     u = truth / np.where(size > 0.0, size, 1.0)[:, None]
     along = np.sum(u @ S * u, axis=1)
     squares, g = along.copy(), np.zeros(len(truth))

@@ -83,7 +83,7 @@ from pipeline.evaluation.held_out.error_breakdown import (
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, reference_vector, squared_norm_errors
 from pipeline.ingest.quality_flags import STUCK
 from pipeline.physics.effects import bench_priors, effect_of, owner_of
-from pipeline.physics.effects.base import OF_THE_BIAS, Owner, unit_of
+from pipeline.physics.effects.base import OF_THE_BIAS, Owner, length, unit_of
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.signal.rests import Rest
 
@@ -350,7 +350,7 @@ def _worse_than_raw(case: HeldOutCase, samples: Sequence[Samples], allowed: floa
     after = [error[s.known] for error, s in zip(errors, samples, strict=True) if error is not None]
     if len(after) < len(samples):
         return None
-    raw = np.concatenate([(np.linalg.norm(s.reading, axis=1) - s.magnitude)[s.known] for s in samples])
+    raw = np.concatenate([(length(s.reading) - s.magnitude)[s.known] for s in samples])
     calibrated = np.concatenate(after)
     sizes = [float(np.sqrt(np.mean(e**2))) for e in (raw, calibrated)]
     if sizes[1] <= max(sizes[0], allowed) or len(raw) < MIN_T_TEST_SAMPLES:

@@ -183,7 +183,7 @@ class Effect(abc.ABC):
 
     def available(self, motion: Motion) -> bool:
         """Return whether the motion has all fields that the effect needs."""
-        return all(getattr(motion, need) is not None for need in self.needs)
+        return all(motion.has(need) for need in self.needs)
 
 
 def _watched(seen: set[str]) -> Motion:
