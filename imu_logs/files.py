@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 from zipfile import BadZipFile, ZipFile
 
 from imu_logs.errors import ConfigurationError, IngestError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 
 ZIP = ".zip"  # of text logs
 KINDS = {

@@ -19,15 +19,17 @@ A covariance whose first element is -1 means that the quantity is absent (sensor
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from mcap.records import Channel, Schema
 
 from imu_logs.clocks import MAX_NANOSECONDS, nanoseconds, of_number, of_pair
 from imu_logs.errors import IngestError
-from imu_logs.log import in_house_unit
+from imu_logs.log import Index, Integers, Mask, Values, in_house_unit
+from imu_logs.mcap_file import ChannelMessages, MessageReader
 from imu_logs.mcap_write import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE, VECTORS
 from imu_logs.message_layout import (
     ONLY,
@@ -43,17 +45,8 @@ from imu_logs.message_layout import (
     short_name,
     stamp_at,
 )
-from imu_logs.profile import HEADER, TIME, FieldPath, MappedField
+from imu_logs.profile import HEADER, TIME, FieldPath, MappedField, McapFormat
 from imu_logs.units import ATTITUDE, COUNTS, TRIADS, UNITS, unit_spelt
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from mcap.records import Channel, Schema
-
-    from imu_logs.log import Index, Integers, Mask, Values
-    from imu_logs.mcap_file import ChannelMessages, MessageReader
-    from imu_logs.profile import McapFormat
 
 T = TypeVar("T")
 SUPPORTED = "cdr with ros2msg, ros1 with ros1msg, protobuf with protobuf, and json are supported"

@@ -12,20 +12,18 @@ A profile describes a file: names, units, separators and the order of columns ar
 from __future__ import annotations
 
 import difflib
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from imu_logs.errors import ConfigurationError
 from imu_logs.units import ACCELEROMETER, ATTITUDE, COUNTS, GYROSCOPE, TRIADS, UNITS
-
-if TYPE_CHECKING:
-    import os
 
 _PACKAGE = Path(__file__).resolve().parent
 # Of the shipped profiles: in a wheel beside this file, in a clone beside the package.

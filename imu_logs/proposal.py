@@ -11,11 +11,12 @@ from __future__ import annotations
 import json
 import re
 import textwrap
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from imu_logs.clocks import find_bursts
 from imu_logs.columns import (
     TEMPERATURE_RANGE,
     Columns,
+    UnknownLog,
     find_columns,
     find_layout,
     is_gravity,
@@ -38,23 +40,17 @@ from imu_logs.guesses import (
     LARGEST_LINEAR,
     OF_SENSOR,
     TO_DECIDE,
+    Evidence,
     Guess,
     even_steps,
     temperature_counts,
     time_unit,
     unit_of_turn,
 )
+from imu_logs.log import Values
 from imu_logs.profile import AUTO, Profile
 from imu_logs.text_read import SHORTEST_PART
 from imu_logs.units import COUNTS, FORCE_UNITS, GYROSCOPE, TABLE_CHANNELS, TRIADS, UNITS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from imu_logs.columns import UnknownLog
-    from imu_logs.guesses import Evidence
-    from imu_logs.log import Values
-
 
 UNITS_OF = {"accelerometer": ("g", "mg", "ug", "m/s^2", "mm/s^2"), "gyroscope": ("deg/s", "mdps", "rad/s", "mrad/s")}
 LEAST_GRAVITY = 0.3  # of gravity, for the median |a| of a log; quality_flags refuses less

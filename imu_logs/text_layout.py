@@ -22,9 +22,11 @@ import csv
 import difflib
 import math
 import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -32,15 +34,9 @@ from pyarrow import csv as arrow_csv
 
 from imu_logs.errors import IngestError
 from imu_logs.files import refuse_foreign, unchanged
-from imu_logs.log import Note
+from imu_logs.log import Integers, Note, Values
 from imu_logs.profile import Column, CsvFormat
 from imu_logs.units import ATTITUDE, CANONICAL, COUNTS, DEGREES, SCALARS, TRIADS, UNITS, unit_in_brackets
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from imu_logs.log import Integers, Values
 
 NUMBER = re.compile(r"\s*[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?\s*")
 LISTED = 5  # lines named in a refusal

@@ -11,21 +11,16 @@ import csv
 import hashlib
 import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import IO, TYPE_CHECKING
+from typing import IO
 
 import numpy as np
 
 from imu_logs.errors import IngestError
 from imu_logs.files import BINARY, UTF_16, is_binary, refuse_foreign
-from imu_logs.log import Note
-from imu_logs.profile import AUTO, COMMENTED, DROP, WHITESPACE
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from imu_logs.log import Integers
-    from imu_logs.profile import CsvFormat
+from imu_logs.log import Integers, Note
+from imu_logs.profile import AUTO, COMMENTED, DROP, WHITESPACE, CsvFormat
 
 BLOCK_BYTES = 1 << 20  # fits in the cache of the processor
 MAX_LINE_BYTES = 1 << 24  # bytes of a line (one of 16 MB is no row of a table), and of the lines before the first row

@@ -12,16 +12,14 @@ is refused.
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
 
 import yaml
 
 from imu_logs.errors import ConfigurationError
 from imu_logs.files import read_text
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
 
 # A simulation.yaml with 10,000 units of 30 values each, which the largest fleet needs, stays below.
 MAX_YAML_BYTES, MAX_YAML_VALUES, MAX_DEPTH = 10_000_000, 400_000, 50

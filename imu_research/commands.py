@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.app.commands import parser_of
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import write_atomically
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 STUDY = """\
 families: {}

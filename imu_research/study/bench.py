@@ -34,14 +34,16 @@ c^2 / 6 per sample on average, where c is one count; this is subtracted.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
 
 from imu_research.study.cases import COURSES, INTERVAL_BY_HAND_S, INTERVAL_S, StudyCase
 from pipeline.core.records import SENSORS, Recording, Values
+from pipeline.core.settings import DataSheet
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gates import min_gain
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
@@ -51,11 +53,6 @@ from pipeline.physics.kinematics import reference_motion
 from pipeline.simulation.campaign import Streams, random_environment, simulate_unit
 from pipeline.simulation.description import Course, UnitDescription, shipped_settings
 from pipeline.simulation.trajectory import Planned, random_gimbals
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from pipeline.core.settings import DataSheet
 
 PERFECT = {"angle_accuracy_deg": 0.0, "rate_error": (0.0, 0.0, 0.0), "direction_deg": [[0.0, 0.0]] * 3}
 OF_WHITE = {"ar_06": 0.6, "ar_09": 0.9}  # coefficient of the autoregression

@@ -29,19 +29,17 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pipeline.core.files import CONFIGS
 from pipeline.core.records import SENSORS, Values
+from pipeline.core.settings import DataSheet
 from pipeline.estimation.uncertainty_budget import DITHERED
 from pipeline.physics.effects import effect
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.simulation.description import shipped_settings
-
-if TYPE_CHECKING:
-    from pipeline.core.settings import DataSheet
 
 NOISES = ("white", "normal", "wander", "random_walk", "one_over_f", "ar_06", "ar_09")
 SHAPES = ("gear_mesh", "temperature_step", "saturation", "exponential", "band")

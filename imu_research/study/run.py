@@ -16,18 +16,21 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from imu_research.study.bench import GAUSS_MARKOV, at_detection, recordings_of, signals_left, withheld_of
 from imu_research.study.cases import METHODS, StudyCase, draw
 from pipeline.app.config import code_digest
-from pipeline.app.one_unit import unit_of_recordings, unit_row
+from pipeline.app.one_unit import ConfiguredUnit, unit_of_recordings, unit_row
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError, PipelineError
+from pipeline.core.files import JSON
 from pipeline.core.records import SENSORS, NotCalibrated, SensorCalibration
 from pipeline.estimation.harm import harmful_on_held_out
 from pipeline.estimation.stages import stage_module
@@ -35,16 +38,7 @@ from pipeline.evaluation.held_out.error_breakdown import errors_of
 from pipeline.evaluation.held_out.samples import HeldOutCase
 from pipeline.physics.effects import leaving_out
 from pipeline.simulation.description import shipped_settings
-from pipeline.unit import STEPS, tasks_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
-
-    from pipeline.app.one_unit import ConfiguredUnit
-    from pipeline.core.files import JSON
-    from pipeline.unit import UnitState
-
+from pipeline.unit import STEPS, UnitState, tasks_of
 
 TRUTH_FILE, RESULTS_FILE = "truth.jsonl", "results.jsonl"
 FAMILIES_WITH_HELD_OUT_ERRORS = ("single", "pairs", "triples", "one_axis", "shape", "cycle", "hand")

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from operator import itemgetter
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -29,22 +30,16 @@ from imu_research.thesis.tables import (
     in_words,
     read_printed,
 )
+from pipeline.core.files import JSON
 from pipeline.core.records import SENSOR_UNITS
 from pipeline.core.records.calibration import corrected, steps_of
 from pipeline.evaluation.held_out.samples import samples_of_motion
 from pipeline.output.pages.chart import AXES_LEGEND, Figure, Panel, SampleMarks, chart
+from pipeline.output.pages.comparison import MeanWithUncertainty
 from pipeline.output.pages.group_charts import Point, curves, stems
 from pipeline.output.pages.held_out_section import held_out_over_time
 from pipeline.output.pages.pages import MINUS, NOTHING, number, template
 from pipeline.simulation.description import shipped_settings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
-    from pipeline.core.files import JSON
-    from pipeline.output.pages.comparison import MeanWithUncertainty
-
 
 PROCEDURES = {"accelerometer": (*STOPS, *CONTINUOUS), "gyroscope": RATES}
 BELOW = {"accelerometer": "stop and go, rest in s; continuous, deg/s", "gyroscope": "rate, deg/s"}

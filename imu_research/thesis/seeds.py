@@ -23,15 +23,18 @@ the home-made table are drawn for each seed.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from imu_research.thesis.tables import AXES, DEVICES, SILENT
 from pipeline.core.records import SENSORS, Mask, NotCalibrated, Recording, Values
 from pipeline.core.records.calibration import corrected
+from pipeline.core.settings import Settings
 from pipeline.estimation.accelerometer import staged as accelerometer
 from pipeline.estimation.gyroscope import cholesky_lu
 from pipeline.estimation.gyroscope import staged as gyroscope
@@ -42,13 +45,6 @@ from pipeline.simulation.campaign import received, simulate_unit
 from pipeline.simulation.description import Description, UnitDescription, read_description, shipped_settings
 from pipeline.simulation.sensor import SimulatedSensor, bias_wander
 from pipeline.unit import run_checked
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
-
-    from pipeline.core.settings import Settings
-
 
 FOUND = ("O_y", "O_z", "M", "b_x", "b_y", "b_z", "S_x", "S_y", "S_z")
 SEED_COLUMNS = ("set", "seed", "cause", "method", *FOUND, "error")

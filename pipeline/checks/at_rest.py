@@ -30,23 +30,17 @@ include the ratio of the rates.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imu_logs.units import TRIADS
 from pipeline.checks.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, refusal
-from pipeline.core.records import SENSOR_UNITS, SENSORS, Note, median
+from pipeline.core.records import SENSOR_UNITS, SENSORS, Integers, Mask, Note, Recording, Values, median
+from pipeline.core.settings import DataSheet, Sensor, Settings
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.signal.rests import RATE_AT_REST, RATE_AT_REST_DPS, rests_from_table, runs
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.records import Integers, Mask, Recording, Values
-    from pipeline.core.settings import DataSheet, Sensor, Settings
-
 
 REST_BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16  # shorter than a knock with its decay; samples, for a standard deviation
 # samples of a rest, and rests of a recording, that determine the usual scatter

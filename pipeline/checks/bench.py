@@ -45,31 +45,27 @@ mirrored accelerometer cannot be detected, because the opposite of gravity rotat
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.core.errors import IngestError
-from pipeline.core.records import AXES, cross
+from pipeline.core.records import AXES, Recording, Values, cross
+from pipeline.core.settings import RecordingFile, Table
 from pipeline.ingest.axis_maps import (
     FAILS_DEG,
     MAX_ROTATION_SAMPLES,
     MIN_MEDIAN_MOVES,
+    MoveByHand,
     axis_matrix,
     misfits_deg,
     moves_of,
 )
 from pipeline.physics.kinematics import UP_AT_ZERO
 from pipeline.physics.signal.rests import still_samples
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.records import Recording, Values
-    from pipeline.core.settings import RecordingFile, Table
-    from pipeline.ingest.axis_maps import MoveByHand
 
 MIN_ANGLE_SAMPLES = 10  # samples, five times the unknowns of an angle
 UP_AT_QUARTER_TURN = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg

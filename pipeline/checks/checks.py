@@ -26,30 +26,24 @@ posterior; s, lambda and theta (or c = 0) maximise its evidence by Laplace's app
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imu_logs.units import TRIADS
 from pipeline.checks.at_rest import check_axes, check_static, with_rates_at_rest
 from pipeline.checks.evidence import place, refusal
 from pipeline.checks.mounting import check_mounting
 from pipeline.checks.reference import check_motion, check_turns
-from pipeline.core.records import SENSOR_UNITS, SENSORS, Note
+from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Note, Recording, Values
+from pipeline.core.settings import Settings, Table
 from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.physics.kinematics import normal_gravity_g
 from pipeline.physics.signal.quiet_motion import rounding_of_readings
 from pipeline.physics.signal.rests import settling_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from pipeline.core.records import Index, Recording, Values
-    from pipeline.core.settings import Settings, Table
-
 
 CELL_S = 10.0  # between the nodes of T, a line between them: of 5 degC with theta = 300 s it misses 1e-3 degC
 CELL_PARTS = 4  # parts of a cell; equal readings in a part become one

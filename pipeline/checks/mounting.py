@@ -8,14 +8,15 @@ difference that only the gyroscope shows, or a turn axis that is not near a body
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.checks.bench import (
     UP_AT_QUARTER_TURN,
+    TurnMounting,
     as_map,
     bench_of,
     by_convention,
@@ -33,16 +34,10 @@ from pipeline.checks.bench import (
 )
 from pipeline.checks.seats import TurnRecording, refined_zeros, seat_notes
 from pipeline.core.errors import IngestError
-from pipeline.core.records import AXES, Note, level_in_body
+from pipeline.core.records import AXES, Note, Recording, Values, level_in_body
+from pipeline.core.settings import Procedure, Sensor, Settings, Table
 from pipeline.ingest.axis_maps import STRAIGHT, axis_maps, axis_matrix
 from pipeline.physics.kinematics import UP_AT_ZERO
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.checks.bench import TurnMounting
-    from pipeline.core.records import Recording, Values
-    from pipeline.core.settings import Procedure, Sensor, Settings, Table
 
 TOLERANCE_DEG = 5.0  # default of procedure.mounting_tolerance_deg: beyond misalignments and seats of a careful bench
 TIME_OFFSET_S = 0.04  # largest plausible one where the sensor's config states none: as in configs/sensor/*.yaml

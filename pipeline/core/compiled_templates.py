@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import MutableMapping
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jinja2
+from jinja2.bccache import Bucket
 
 from pipeline.core.files import state_of_files
 from pipeline.core.user_cache import from_cache, to_cache
-
-if TYPE_CHECKING:
-    from collections.abc import MutableMapping
-
-    from jinja2.bccache import Bucket
 
 
 class CompiledTemplates(jinja2.BytecodeCache):

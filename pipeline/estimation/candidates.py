@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise, product
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, NotObservableError
+from pipeline.core.records import Motion, Recording, SensorCalibration, Values
+from pipeline.core.settings import DataSheet, Settings, Table
 from pipeline.estimation.design import MAX_BEND_SHARE_OF_ROOM, Bend, EffectColumns, NormalPrior, placed
 from pipeline.estimation.gates import possible
+from pipeline.estimation.observations import Observations
 from pipeline.physics.effects import catalogue, effect, stated_priors
 from pipeline.physics.effects.base import Effect, parameter_limits
 from pipeline.physics.effects.mounting import SETUP_EFFECTS
 from pipeline.physics.signal.filters import MIN_SWING_DEGC, heats_and_cools
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.records import Motion, Recording, SensorCalibration, Values
-    from pipeline.core.settings import DataSheet, Settings, Table
-    from pipeline.estimation.observations import Observations
 
 NO_SWING = f"the temperature does not rise and fall by {MIN_SWING_DEGC:g} degC while it is recorded"
 AUTO = "auto"  # instead of a list of effects: the effects that the diagnosis selects

@@ -17,25 +17,21 @@ known. (With 20 rests of an MPU-6050 in 110 s lambda is 12; the gate is 358. Of 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
 from pipeline.estimation.candidates import MOUNTING, NO_SWING, ZERO
 from pipeline.estimation.gates import min_gain, passes
+from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.multi_position.selection import DRIFT, no_candidate
+from pipeline.estimation.observations import Observations
+from pipeline.estimation.ranking import Score
+from pipeline.estimation.selection import Selection
 from pipeline.physics.effects import catalogue, effect
+from pipeline.physics.effects.base import Effect
 from pipeline.physics.effects.formula_effect import FormulaEffect
 from pipeline.physics.signal.filters import MIN_SWING_DEGC, heats_and_cools
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
-
-    from pipeline.estimation.multi_position import selection as by_hand
-    from pipeline.estimation.observations import Observations
-    from pipeline.estimation.ranking import Score
-    from pipeline.estimation.selection import Selection
-    from pipeline.physics.effects.base import Effect
 
 OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "level": "nothing that shows the heading"}
 UNDESCRIBED = "the table's log describes no sample at which the rate changes"

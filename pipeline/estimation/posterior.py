@@ -18,9 +18,9 @@ columns; if sets with other timing effects are probable, the fit is repeated wit
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -48,12 +48,7 @@ from pipeline.estimation.generalized_least_squares import JointFit, design_at, f
 from pipeline.estimation.ranking import MIN_NEW_COLUMN_SHARE, without
 from pipeline.estimation.selection import DELAYS, Selection
 from pipeline.physics.effects import catalogue, effect
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-
-    from pipeline.physics.effects.base import Effect
-
+from pipeline.physics.effects.base import Effect
 
 INCLUSION = 0.02  # prior probability of each effect
 FIRST_VERSION_AND_SCALE = 0, 3  # version and scale at which the search for the best ones of a set begins

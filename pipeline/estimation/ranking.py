@@ -9,8 +9,8 @@ projected out of the candidates' columns first, so that each candidate is a sepa
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -18,11 +18,7 @@ import scipy
 from pipeline.core.records import BASE_COUNT, Index, Values, standard_uncertainty
 from pipeline.estimation.design import Design, EffectColumns, Start
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, random_walks
-
-if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-
-    from pipeline.estimation.observations import Observations
+from pipeline.estimation.observations import Observations
 
 MIN_NEW_COLUMN_SHARE = 1e-3  # share of a column's norm, after projection of the base, from which on it is determined
 # the same of the variance of a candidate's weakest direction, after projection of the selected effects

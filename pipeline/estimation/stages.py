@@ -16,11 +16,12 @@ covariance is zero, which the budget states; any held-out error beyond noise is 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -48,6 +49,7 @@ from pipeline.core.records import (
     Values,
     base_values,
 )
+from pipeline.core.settings import DataSheet, Method, Settings
 from pipeline.estimation.engine import ResidualNoise, ScaledColumns, linear_convergence
 from pipeline.estimation.gauss_markov import WanderPrior, block_covariance
 from pipeline.estimation.known_effects import known_effects, subtracted, with_known, without_known
@@ -55,6 +57,7 @@ from pipeline.estimation.multi_position.model import motion_at_rests
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import Rests, readings_in, rests_of
 from pipeline.estimation.table_errors import type_b
+from pipeline.estimation.turns import TurnPart
 from pipeline.estimation.uncertainty_budget import (
     GRAVITY,
     TEMPERATURE,
@@ -66,13 +69,6 @@ from pipeline.estimation.uncertainty_budget import (
     scatter_contribution,
 )
 from pipeline.physics.effects import effect_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from pipeline.core.settings import DataSheet, Method, Settings
-    from pipeline.estimation.turns import TurnPart
-
 
 GIVEN, GIVEN_SOURCE = "given", "given calibration"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null

@@ -18,25 +18,21 @@ An attitude log has no stops: its angle errors are three constant turns of each 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.records import NORMAL, SENSORS, Contribution, Index, Motion, Values, noise_of_steps
+from pipeline.core.settings import Table
 from pipeline.estimation.engine import LinearMap, ResidualNoise, assess_noise
+from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import truth
 from pipeline.physics.kinematics import ABOUT, earth_of
 from pipeline.physics.signal.rests import RATE_AT_REST_DPS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from pipeline.core.settings import Table
-    from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 
 INPUT_EFFECT_ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ

@@ -18,15 +18,17 @@ import csv
 import glob
 import itertools
 import os
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 import imu_logs
 from imu_logs.files import is_message_log
+from imu_logs.log import Log
 from imu_logs.profile import TIME, Checks, CsvFormat, checks_of, csv_formats
 from imu_logs.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError, InputError, MissingInputError, shortened
@@ -42,20 +44,13 @@ from pipeline.core.records import (
     files_of_readings,
     rate_of_attitude,
 )
+from pipeline.core.settings import Ingest, Procedure, RecordingFile, Sensor
 from pipeline.ingest.axis_maps import STRAIGHT, axis_maps, axis_matrix, in_body_axes, map_of_orientation
 from pipeline.ingest.clock_alignment import unwrapped
 from pipeline.ingest.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.ingest.files import candidate_files
 from pipeline.ingest.quality_flags import examine
 from pipeline.ingest.recordings_sheet import require_recordings
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
-    from pathlib import Path
-
-    from imu_logs.log import Log
-    from pipeline.core.settings import Ingest, Procedure, RecordingFile, Sensor
-
 
 MAX_NAMED_FILES = 5  # further files that an error lists
 LEAST_TURN_OF_ROWS = 0.01  # rad: rows of attitudes differ by more, samples of a rest or of movement by less

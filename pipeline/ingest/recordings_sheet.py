@@ -18,20 +18,16 @@ from __future__ import annotations
 import csv
 import math
 import os
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import numpy as np
 
 from imu_logs.files import read_text
 from pipeline.core.errors import ConfigurationError, IngestError, MissingInputError
 from pipeline.core.records import AXES
-from pipeline.core.settings import FileKind, RecordingFile
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from pipeline.core.settings import Procedure, Settings
+from pipeline.core.settings import FileKind, Procedure, RecordingFile, Settings
 
 FILE_KINDS: tuple[str, ...] = get_args(FileKind)
 COLUMNS = ("file", "kind", "axis", "angle_deg", "angle_accuracy_deg", "held_out", "label")

@@ -27,20 +27,24 @@ Write a simulated campaign: units.csv, campaign.yaml, the recordings, and the tr
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import scipy
 import yaml
+from numpy.typing import NDArray
 
 from imu_logs.units import SECOND_NS
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import AXES, SENSORS, Recording, Values, continuous
 from pipeline.core.settings import ProgramRest, ProgramTurn, Repeated, Sensor, Table
 from pipeline.ingest.arrow import write_recording
+from pipeline.ingest.commanded_motion import Program
 from pipeline.ingest.recordings_sheet import COLUMNS, SHEET
 from pipeline.physics.kinematics import earth_of
 from pipeline.simulation.description import (
@@ -66,15 +70,6 @@ from pipeline.simulation.sensor import (
     drawn_sensors,
 )
 from pipeline.simulation.trajectory import CommandedTurns, Gimbals, Planned, RestsAndMoves, random_errors, rotation_by
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from pipeline.ingest.commanded_motion import Program
-
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
 ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3  # of CSV files: rounding far below any noise

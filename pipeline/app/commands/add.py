@@ -7,19 +7,22 @@ it is refused, and the message names the place to edit.
 
 from __future__ import annotations
 
+import argparse
 import functools
 import json
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import yaml
 
 from pipeline.app.commands import add_run_options, parser_of
 from pipeline.app.commands.run import run_snakemake
 from pipeline.app.config.campaign import TAKE_OVER, find_campaign, read_layers
-from pipeline.app.config.layers import DEVICES_FOLDER, key_of
+from pipeline.app.config.compose import Composer
+from pipeline.app.config.layers import DEVICES_FOLDER, Layer, Layers, key_of
 from pipeline.app.config.options import SettingProblem, nearest, parse
 from pipeline.app.config.owner import require_own_results
 from pipeline.core.errors import ConfigurationError, MissingInputError, PipelineError, shortened
@@ -30,14 +33,6 @@ from pipeline.core.verdicts import Verdict
 from pipeline.output.exports import ExportedUnit
 from pipeline.output.outcome import DEFAULT_RESULTS, NAMED_PER_LINE, changes_of, read_summary, run_command
 from pipeline.physics.effects import catalogue
-
-if TYPE_CHECKING:
-    import argparse
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from pipeline.app.config.compose import Composer
-    from pipeline.app.config.layers import Layer, Layers
-
 
 OVERRIDES_KEY = "overrides"
 SMALLEST_CHANGE_OF_A_FILE = 0.1  # of its held-out error, which is said

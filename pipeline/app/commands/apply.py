@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from imu_logs.files import MESSAGE_FORMATS
 from pipeline.app.commands import parser_of
@@ -17,10 +18,6 @@ from pipeline.core.pack import is_published, read_published
 from pipeline.core.records import SENSORS
 from pipeline.core.verdicts import DOUBTS, KINDS, Verdict
 from pipeline.physics.compensation import SMOOTHING_S, load, read_calibration
-
-if TYPE_CHECKING:
-    import argparse
-    from collections.abc import Sequence
 
 EPILOG = """\
 In a CSV log, calibrated columns in g and deg/s (accel_x_g .. gyro_z_dps) replace the columns of the sensors; all other

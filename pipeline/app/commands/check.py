@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import shlex
 import sys
 import textwrap
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+from imu_logs.columns import UnknownLog
 from imu_logs.files import SUFFIXES
 from imu_logs.guesses import TO_DECIDE
 from imu_logs.proposal import Proposal, as_yaml, layouts_of, not_found
@@ -44,12 +47,6 @@ from pipeline.ingest.files import FILE, grouped, recording_files
 from pipeline.output.outcome import NAMED_PER_LINE, FoundMounting, Ways, as_overrides, found_mountings
 from pipeline.physics.statements import LEFT_OUT_REASONS
 from pipeline.simulation.description import read_option
-
-if TYPE_CHECKING:
-    import argparse
-    from collections.abc import Callable, Mapping, Sequence
-
-    from imu_logs.columns import UnknownLog
 
 MOST_IN_FULL = 3  # logs of one layout
 WIDTH = 118  # characters of a line

@@ -6,23 +6,20 @@ The origin of a value is its strongest override, or that of a branch above it; e
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import takewhile
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
 from pipeline.app.commands import parser_of
 from pipeline.app.config.campaign import find_campaign, read_layers
+from pipeline.app.config.compose import Composer
+from pipeline.app.config.layers import Layer
 from pipeline.app.config.options import GROUPS, PYTHON, SettingProblem, default_option, nearest, parse, read_option
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
 from pipeline.core.settings import REQUIRED_FIGURES, range_settings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from pipeline.app.config.compose import Composer
-    from pipeline.app.config.layers import Layer
 
 Key = tuple[str, ...]  # the path of a value
 COLUMN = 56  # of the origins

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.app.commands import parser_of
 from pipeline.simulation import REST_BY_HAND_S
-
-if TYPE_CHECKING:
-    import argparse
-    from collections.abc import Sequence
 
 EPILOG = """\
 The next rest is the one that reduces the uncertainty of the accelerometer's calibration most. The goal is reached when

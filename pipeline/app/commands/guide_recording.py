@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,11 +36,6 @@ from pipeline.ingest.files import grouped, recording_files
 from pipeline.ingest.read import read_table, to_recording
 from pipeline.physics.signal.rests import WINDOW_S, Rest, find_rests
 from pipeline.unit import Task, UnitFiles, UnitState, run_steps
-
-if TYPE_CHECKING:
-    import argparse
-    from collections.abc import Sequence
-
 
 POLL_S = 1.0  # between two readings of a growing log: short against a rest
 STILL_RESTING_S = 1.0  # from the end of a rest to that of the log, below which the rest may continue

@@ -4,28 +4,25 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from imu_logs.files import ZIP, is_message_log
 from imu_logs.profile import checks_of
+from pipeline.app.config.campaign import Campaign
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.options import SettingProblem, nearest
 from pipeline.checks.checks import check_recordings
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
+from pipeline.core.records import Recording
 from pipeline.core.settings import Ingest, RecordingFile, Sensor, Settings
 from pipeline.ingest.files import candidate_files
 from pipeline.ingest.read import read_table, to_recording
 from pipeline.simulation.description import shipped_settings
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.app.config.campaign import Campaign
-    from pipeline.core.records import Recording
 
 DEFAULT_PROFILE = "canonical_csv"
 SEARCHED_FOLDERS = 4  # from the folder of the log upwards: a campaign is above raw/<unit>/

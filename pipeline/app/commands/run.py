@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from pipeline.app.commands import add_run_options, parser_of
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import SHIPPED
 from pipeline.output.outcome import DEFAULT_RESULTS
-
-if TYPE_CHECKING:
-    import argparse
-    from collections.abc import Sequence
 
 EPILOG = """\
 examples:

@@ -16,10 +16,11 @@ from __future__ import annotations
 import difflib
 import hashlib
 import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from imu_logs.files import read_text
 from imu_logs.units import SENSORS
@@ -27,12 +28,7 @@ from imu_logs.yaml_file import MAX_YAML_BYTES, read_yaml
 from pipeline.core.errors import ConfigurationError, PipelineError
 from pipeline.core.files import CONFIGS
 from pipeline.core.settings import OF_BENCH, RunSettings, Sensor, Settings, UserEffectFiles
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from pipeline.physics.effects.base import Effect
-
+from pipeline.physics.effects.base import Effect
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 RUN_SETTINGS = tuple(RunSettings.model_fields)

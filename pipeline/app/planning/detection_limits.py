@@ -25,25 +25,21 @@ with signs d. All sums of squares are polynomials in a, so no size a needs a new
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
+from pipeline.core.records import Mask, Noise, Values
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gates import min_gain
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
+from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.multi_position.fit import log_likelihood, project_out
 from pipeline.estimation.multi_position.model import NoiseHypothesis
 from pipeline.estimation.ranking import UNIT_COLUMN_RIDGE
 from pipeline.estimation.selection import DELAYS, LOOK_ALIKE_SHARE, Selection
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.core.records import Mask, Noise, Values
-    from pipeline.estimation.multi_position import selection as by_hand
 
 BISECTION_STEPS = 14  # of bisection: a factor of 1e11 to 0.2 %
 MIN_LIMIT_SHARE, MAX_LIMIT_SHARE = 1e-8, 1e3  # share of the limits

@@ -20,14 +20,18 @@ from __future__ import annotations
 
 import re
 import textwrap
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import islice, permutations, product
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from mcap.records import Channel, Schema
 
 from imu_logs.files import MESSAGE_FORMATS, SUFFIXES, TEXTS, kind_of
 from imu_logs.guesses import BURST_INTERVAL_DIFFERENCE
+from imu_logs.log import Values
 from imu_logs.mcap_file import McapReader
 from imu_logs.message_decoder import ARRAYS, KINDS, object_decoder, ros_layouts
 from imu_logs.message_layout import short_name
@@ -48,15 +52,6 @@ from pipeline.ingest.read import read_attitudes, read_table, to_recording
 from pipeline.physics.signal.rests import SHORTEST_REST_S, Rest, find_rests, rests_from_table, runs
 from pipeline.physics.signal.segments import MAX_AXIS_SINE, turns_by_hand
 from pipeline.simulation.description import shipped_settings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from mcap.records import Channel, Schema
-
-    from imu_logs.log import Values
-
 
 MAX_SEARCHED_SAMPLES = 500_000  # searched for rests and moves
 MIN_VARIANCE_SAMPLES = 3  # of a rest, for a variance

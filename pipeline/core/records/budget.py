@@ -10,16 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from imu_logs.log import Index, Mask, Values
 from imu_logs.units import AXES, SENSOR_UNITS
-
-if TYPE_CHECKING:
-    from imu_logs.log import Index, Mask, Values
-
 
 BIAS_NAMES = tuple(f"bias_{axis}" for axis in AXES)
 MATRIX_NAMES = tuple(f"matrix_{row}{column}" for row in AXES for column in AXES)

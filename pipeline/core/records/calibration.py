@@ -18,10 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Self, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
+from imu_logs.log import Mask, Values
 from imu_logs.units import SENSOR_UNITS
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.records.budget import (
@@ -41,12 +43,6 @@ from pipeline.core.records.budget import (
     matrix_of,
     unlimited,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from imu_logs.log import Mask, Values
-
 
 STEP_KINDS = "subtract, matrix, two_sided"
 COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, times a factor for sums over many residuals

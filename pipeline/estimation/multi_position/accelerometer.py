@@ -32,13 +32,15 @@ one attitude a change of the bias along gravity is not distinguished from one of
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
-from pipeline.core.records import BASE_COUNT
+from pipeline.core.records import BASE_COUNT, Mask, Motion, Noise, Recording, SensorCalibration, Values
+from pipeline.core.settings import DataSheet, Settings
+from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.multi_position.faces_and_turns import Faces, faces_of
 from pipeline.estimation.multi_position.model import (
     EquationBlock,
@@ -50,15 +52,6 @@ from pipeline.estimation.multi_position.model import (
     stacked,
 )
 from pipeline.estimation.rest_means import HELD_OUT, Rests, rests_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.core.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
-    from pipeline.core.settings import DataSheet, Settings
-    from pipeline.estimation.design import EffectColumns
-    from pipeline.estimation.multi_position.model import State
-
 
 FORCE_ITERATIONS = 12  # of effects that depend on the force
 SETTLED_FORCE_G = 1e-12  # g

@@ -27,29 +27,23 @@ a multiple of the stated angle (``pipeline.physics.signal.segments``).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.core.records import AXES, Index, Mask, Motion, Recording, SensorCalibration, TurnAngle, Values
+from pipeline.core.settings import FacesByHand as StatedFaces
+from pipeline.core.settings import HandTurns, Procedure, RecordingFile
+from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.multi_position.model import EquationBlock, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import padded, sound_span, spans_between, tangents, trapezoids
 from pipeline.estimation.rest_means import ROLE, Rests
 from pipeline.physics.kinematics import skew
 from pipeline.physics.signal.filters import temperature_rate_of
 from pipeline.physics.signal.segments import AXIS_ACCURACY, LOGGED_TURNS, MAX_AXIS_SINE, SCALE, multiples
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.records import Index, Recording, Values
-    from pipeline.core.settings import FacesByHand as StatedFaces
-    from pipeline.core.settings import HandTurns, Procedure, RecordingFile
-    from pipeline.estimation.design import EffectColumns
-    from pipeline.estimation.rest_means import Rests
-
 
 BEGUN_DEG = 2.0  # as ``TURN_LIMIT_DEG`` of a rest: a larger turn before the first rest of a recording is motion
 NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip askew in its case, and a hand

@@ -36,13 +36,25 @@ then shows where the move ended, with more noise than the mean.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.records import BASE, BASE_COUNT, BIAS, MATRIX, matrix_of
+from pipeline.core.records import (
+    BASE,
+    BASE_COUNT,
+    BIAS,
+    MATRIX,
+    Index,
+    Mask,
+    Recording,
+    SensorCalibration,
+    Values,
+    matrix_of,
+)
+from pipeline.core.settings import Procedure
 from pipeline.estimation.engine import root_of
 from pipeline.estimation.multi_position.model import motion_at_rests
 from pipeline.estimation.rest_means import ROLE, Rests, rest_means, rests_of, sound_samples
@@ -51,12 +63,6 @@ from pipeline.physics.kinematics import turn_by_vector
 from pipeline.physics.measurement import compensate
 from pipeline.physics.signal.filters import filter_autocovariance, variance_of_mean
 from pipeline.physics.signal.rests import Rest
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.records import Index, Mask, Recording, SensorCalibration, Values
-    from pipeline.core.settings import Procedure
 
 MAX_MOVE_S = 60.0  # see ``moves_of``
 MAX_INTERPOLATED_INTERVALS = 3.5  # intervals without a sample, over which a rate is not interpolated

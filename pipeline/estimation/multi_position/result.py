@@ -10,8 +10,8 @@ gravity's length, with the equations of ``accelerometer`` and ``faces_and_turns`
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -24,9 +24,11 @@ from pipeline.core.records import (
     SensorCalibration,
     StageDetails,
     StageResult,
+    UnitRecordings,
     Values,
     base_values,
 )
+from pipeline.core.settings import Procedure, Settings
 from pipeline.estimation.engine import draw_normal, scaled_inverse
 from pipeline.estimation.monte_carlo import quadratic_results, with_trials
 from pipeline.estimation.multi_position import accelerometer, gyroscope
@@ -49,13 +51,6 @@ from pipeline.estimation.uncertainty_budget import (
     limit_contribution,
     scatter_contribution,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.records import UnitRecordings
-    from pipeline.core.settings import Procedure, Settings
-
 
 STEP_UNCERTAINTIES = 0.1  # of a standard uncertainty: the columns are differentiated where they are used
 REMARK = {

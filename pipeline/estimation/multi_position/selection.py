@@ -12,14 +12,16 @@ noise is known and a scatter only adds to it: sigma is at least 1.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
+from pipeline.core.records import Mask, Noise, SensorCalibration, Values
+from pipeline.core.settings import DataSheet
 from pipeline.estimation.candidates import NO_SWING, limits_of, starts_of, time_constants
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.evidence import CandidateProblem, linear_problem
@@ -37,21 +39,13 @@ from pipeline.estimation.multi_position.fit import (
     log_determinants,
     project_out,
 )
-from pipeline.estimation.multi_position.model import Model, NoiseHypothesis, State, selection_hypotheses
+from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, selection_hypotheses
 from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import Score, without
+from pipeline.estimation.rest_means import Rests
 from pipeline.estimation.selection import MAX_SELECTED_EFFECTS
 from pipeline.physics.effects import catalogue, effect, effect_from
 from pipeline.physics.effects.base import Effect, Owner
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
-
-    from pipeline.core.records import Mask, Noise, SensorCalibration, Values
-    from pipeline.core.settings import DataSheet
-    from pipeline.estimation.multi_position.model import Equations
-    from pipeline.estimation.rest_means import Rests
-
 
 MAX_SELECTION_ROUNDS = 3 * MAX_SELECTED_EFFECTS
 POSSIBLE = 10.0  # times its limits, beyond which an effect is no explanation

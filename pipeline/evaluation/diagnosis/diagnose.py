@@ -27,14 +27,16 @@ found is n_e of the effect's own error, by the parameters of the diagnosis.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pipeline.core.errors import ConvergenceError, NotObservableError
 from pipeline.core.records import (
     MATRIX,
+    Candidate,
     Coefficient,
     FittedEffect,
     MovesError,
@@ -45,7 +47,7 @@ from pipeline.core.records import (
     SensorValidation,
     Values,
 )
-from pipeline.core.settings import Uncertainty
+from pipeline.core.settings import Effects, Settings, Table, Uncertainty
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
 from pipeline.estimation.design import OTHER_PREFIX
@@ -73,13 +75,6 @@ from pipeline.physics.effects.base import parameter_limits, truth, unit_of
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.measurement import linear_truth
 from pipeline.physics.statements import not_determined
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.core.records import Candidate, Recording
-    from pipeline.core.settings import Effects, Settings, Table
-
 
 EARTH = "earth_rotation"
 OTHER_FILE = "check that the sensor's file is that of this unit, and that its range and units are right"

@@ -10,37 +10,39 @@ Effects that raise the held-out error significantly (``pipeline.estimation.harm`
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from pipeline.core.records import Answer, Candidate, Estimate, SensorDiagnosis, Wander, standard_uncertainty
+from pipeline.core.records import (
+    Answer,
+    Candidate,
+    Dependence,
+    Estimate,
+    MethodError,
+    Noise,
+    Recording,
+    SensorCalibration,
+    SensorDiagnosis,
+    TableEvidence,
+    Values,
+    Wander,
+    standard_uncertainty,
+)
+from pipeline.core.settings import DataSheet, Settings
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.design import OTHER_PREFIX, EffectColumns, placed
 from pipeline.estimation.gates import MIN_DELTA_BIC
+from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
+from pipeline.estimation.ranking import Score
 from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
 from pipeline.evaluation.diagnosis.verdict import if_observable
 from pipeline.evaluation.diagnosis.words import experiment_of, listed, of_unknown, plain, to_distinguish
 from pipeline.physics.effects import catalogue, effect
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.core.records import (
-        Dependence,
-        MethodError,
-        Noise,
-        Recording,
-        SensorCalibration,
-        TableEvidence,
-        Values,
-    )
-    from pipeline.core.settings import DataSheet, Settings
-    from pipeline.estimation.gauss_markov import Setting
-    from pipeline.estimation.ranking import Score
 
 LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings
 

@@ -17,13 +17,15 @@ m p < 1e-3, with m the number of all tests (``fit.judged_curves``).
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError, PipelineError
-from pipeline.core.records import Dependence, UnitRecordings
+from pipeline.core.records import Dependence, Mask, Noise, Recording, SensorCalibration, UnitRecordings
+from pipeline.core.settings import Settings
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.design import EffectColumns
@@ -40,7 +42,7 @@ from pipeline.estimation.multi_position.fit import (
     log_likelihoods,
     project_out,
 )
-from pipeline.estimation.multi_position.model import NoiseHypothesis
+from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import LAG, SelectionByHand, hysteresis_of, posterior
 from pipeline.estimation.noise import noise_of
@@ -54,13 +56,6 @@ from pipeline.evaluation.diagnosis.residual_dependence import added_variable_of_
 from pipeline.evaluation.diagnosis.verdict import verdict_of_selection_by_hand
 from pipeline.evaluation.diagnosis.words import HYSTERESIS, listed, plain
 from pipeline.physics.effects import catalogue, effect, effect_from
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.core.records import Mask, Noise, Recording, SensorCalibration
-    from pipeline.core.settings import Settings
-    from pipeline.estimation.multi_position.model import Equations, Model
 
 NEEDED_RECORDING = MORE_RESTS
 WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"

@@ -17,13 +17,14 @@ uncertainties (Cook, Technometrics 19, 1977).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.errors import ConvergenceError
-from pipeline.core.records import BASE_COUNT, Noise, SelectionErrors, SensorCalibration, TableEvidence
+from pipeline.core.files import JSON
+from pipeline.core.records import BASE_COUNT, Index, Noise, SelectionErrors, SensorCalibration, TableEvidence, Values
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Design, EffectColumns, placed
@@ -32,7 +33,7 @@ from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import JointFit, calibration_of
 from pipeline.estimation.harm import fits_of, harmful_in_turns, harmful_on_held_out
 from pipeline.estimation.observability import alike_with_zeros, hidden_in, never_shown, not_observable, one_way
-from pipeline.estimation.observations import ROLES, observe, without_each_recording
+from pipeline.estimation.observations import ROLES, Observations, observe, without_each_recording
 from pipeline.estimation.posterior import completed, curves_of, posterior
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
@@ -47,15 +48,6 @@ from pipeline.evaluation.held_out.error_breakdown import errors_of
 from pipeline.evaluation.held_out.samples import HeldOutCase
 from pipeline.evaluation.held_out.validation import noise_floors
 from pipeline.physics.effects import catalogue
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.files import JSON
-    from pipeline.core.records import Index, Values
-    from pipeline.estimation.observations import Observations
-    from pipeline.estimation.selection import Selection
-
 
 MOST_OF = 0.5  # share of the gain that the listed seconds have together
 MAX_INFLUENTIAL_STRETCHES = 5

@@ -7,19 +7,15 @@ no effect.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
+from pipeline.core.records import Agreement, Dependence, MovesError, SelectionErrors, SensorDiagnosis
 from pipeline.core.verdicts import MARK_AFTER_MOVES, Verdict, decided_words
 from pipeline.estimation.stages import FitStage
 from pipeline.evaluation.diagnosis.words import listed, of_unknown, plain, template
 from pipeline.physics.effects import catalogue
 from pipeline.physics.effects.base import unit_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.core.records import Agreement, Dependence, MovesError, SelectionErrors, SensorDiagnosis
 
 EXPLAINED = 1.5  # times the noise: largest residual that is noise; it was 0.92 to 1.14 in 140 sensors without an effect
 # least share of the residual's excess that selected effects explain if the residual has another cause too

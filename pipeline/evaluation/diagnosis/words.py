@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jinja2 import FileSystemLoader, Template
 
 from pipeline.core.compiled_templates import Templates
-from pipeline.core.records import Answer
+from pipeline.core.records import Answer, Dependence
 from pipeline.core.verdicts import Verdict, figure_and_size
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed
 from pipeline.estimation.design import OTHER_PREFIX
 from pipeline.physics.effects import catalogue
 from pipeline.physics.effects.base import largest_by_unit, unit_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.records import Dependence
 
 MOST_ANSWERS = 4  # answers of an answer set that a sentence lists
 STAYS = 1.15  # times the noise floor: two standard deviations of the rms of 100 samples, 1 / sqrt(200) each

@@ -24,12 +24,14 @@ with the eigenvalues l_i of S and the components t_i of t along its eigenvectors
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.records import Index, Mask, Motion, Noise, Recording, SensorCalibration, Values
+from pipeline.core.settings import Settings, Table
 from pipeline.estimation.gauss_markov import variance_of_average
 from pipeline.estimation.observations import filtered_motion
 from pipeline.estimation.rest_means import held_out_rests, rest_means, split_rests, variances_of_means
@@ -40,13 +42,7 @@ from pipeline.physics.measurement import linear_truth
 from pipeline.physics.signal.encoder_rate import MIN_RATE_SAMPLES, EncoderRate, rate_by_angle
 from pipeline.physics.signal.filters import filter_autocovariance, temperature_rate_of
 from pipeline.physics.signal.quiet_motion import creep_of_rest, posterior_creep_rates
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.core.records import Index, Mask, Motion, Noise, Recording, SensorCalibration, Values
-    from pipeline.core.settings import Settings, Table
-    from pipeline.physics.signal.rests import Rest
+from pipeline.physics.signal.rests import Rest
 
 OTHER_SENSOR = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}
 UNCALIBRATED_ERROR = 0.05  # of scale and axes before calibration: scale 3 %, cross-axis 2 % (data sheets)

@@ -13,28 +13,24 @@ not written, and the report states the reason.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from itertools import repeat
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from markupsafe import Markup
 
+from pipeline.core.files import JSON
 from pipeline.core.records import AXES, SENSORS
+from pipeline.core.settings import Certificate, Settings
 from pipeline.core.verdicts import DOUBTS, KINDS, Verdict, error_of
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.outcome import run_command
 from pipeline.output.pages.held_out_section import first_and_last_step
 from pipeline.output.pages.pages import number, template
-from pipeline.output.pages.parameters import fitted_parameters, reading_errors
+from pipeline.output.pages.parameters import Parameter, fitted_parameters, reading_errors
 from pipeline.output.pages.unit_page import files_read
 from pipeline.physics.statements import beyond_uncertainty, frame_words
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from pipeline.core.files import JSON
-    from pipeline.core.settings import Certificate, Settings
-    from pipeline.output.pages.parameters import Parameter
 
 STAMP = "NOT A CALIBRATION CERTIFICATE - incomplete: "
 ONLY_THIS_ITEM = "The results relate only to the item calibrated."
