@@ -162,7 +162,7 @@ def _scatter(values: Values) -> float:
 
 def _widened(excess: Values) -> Values:
     rows = np.flatnonzero(np.any(excess > 0, axis=1))
-    for event in np.split(rows, np.flatnonzero(np.diff(rows) > SAME_EVENT) + 1):
+    for event in [] if not rows.size else np.split(rows, np.flatnonzero(np.diff(rows) > SAME_EVENT) + 1):
         if len(event) > 2:
             inside = slice(max(event[0] - 2, 0), event[-1] + 3)
             excess[inside] = np.maximum(excess[inside], np.finfo(float).tiny)
@@ -222,7 +222,7 @@ class _Motion:
         A = np.hstack(columns)
         if A.shape[1] == 1 or not np.isfinite(A).all():
             return reading
-        return np.asarray(reading - A @ np.linalg.lstsq(A, reading, rcond=None)[0])
+        return np.asarray(reading - A @ np.linalg.lstsq(A.T @ A, A.T @ reading, rcond=None)[0])
 
     def change(self, sensor: str) -> Values:
         """Return the largest change of the residual by the motion: (n,) array, infinite if the motion is unknown."""
@@ -265,20 +265,20 @@ def leave_out_shaken_rests(recording: Recording, note: Callable[[str, Index, str
     if len(pieces) < FEWEST_PIECES:
         return recording
     found = {s: r for s in SENSOR_UNITS if (r := recording.reading(s)) is not None and np.isfinite(r).all()}
-    worst: tuple[float, str] = (0.0, "")
-    shaken = np.zeros(len(pieces), bool)
-    for sensor, reading in found.items():
-        excess, scatter = _excess(reading, pieces[:, :2])
-        shaken |= excess > 0.0
-        first = int(np.argmax(excess))
-        if excess[first] > worst[0]:
-            times = recording.time[pieces[first, 0]]
-            worst = float(excess[first]), f"the {sensor} scatters {scatter[first]:.1f} times as usual at {times:.6g} s"
+    if not found:
+        return recording
+    excess, scatter = _excess(np.concatenate([*found.values()], axis=1), pieces[:, :2])
+    shaken = np.any(excess > 0.0, axis=1)
     count = int(shaken.sum())
     if count == 0 or count > max(1.0, LARGEST_SHARE * len(pieces)):
         return recording
     rows = np.concatenate([np.arange(a, b) for a, b in pieces[shaken, 2:]])
-    detail = f"{count} of {len(pieces)} pieces of rests left out, in which the unit was shaken or leant on; {worst[1]}"
+    sensor, first = divmod(int(np.argmax(excess.T)), len(pieces))
+    worst = f"the {[*found][sensor]} scatters {scatter[first, sensor]:.1f} times as usual"
+    detail = (
+        f"{count} of {len(pieces)} pieces of rests left out, in which the unit was shaken or leant on; {worst} at "
+        f"{recording.time[pieces[first, 0]]:.6g} s"
+    )
     return without_rows(recording, rows, note("N-SHAKEN", rows, detail))
 
 
@@ -310,25 +310,32 @@ def _pieces(recording: Recording) -> Index:
     return np.array(out, np.intp).reshape(-1, 4)
 
 
-def _excess(reading: Values, pieces: Index) -> tuple[Values, Values]:
-    """Return the excess of each piece's chi^2 over its limit, and its scatter relative to the usual: (p,) arrays."""
-    count = np.diff(pieces, axis=1)[:, 0].astype(float)
+def _excess(readings: Values, pieces: Index) -> tuple[Values, Values]:
+    """Return the excess of each piece's chi^2 over its limit, and its scatter relative to the usual: (p, s) arrays.
+
+    ``readings``: (n, 3 s), of s sensors.
+    """
+    count = np.diff(pieces, axis=1).astype(float)
     bounds = pieces.ravel()
-    centred = np.append(reading - reading.mean(axis=0), np.zeros((1, 3)), axis=0)
+    centred = np.append(readings - readings.mean(axis=0), np.zeros((1, readings.shape[1])), axis=0)
     sums, squares = (np.add.reduceat(v, bounds, axis=0)[::2] for v in (centred, centred**2))
-    about_mean = np.maximum(squares - sums**2 / count[:, None], 0.0)
+    about_mean = np.maximum(squares - sums**2 / count, 0.0)
     freedom = 3.0 * (count - 1.0)
     most = np.maximum(RATIO * freedom, freedom + SIGNIFICANT_DEVIATIONS * np.sqrt(2.0 * freedom) + CHI_SQUARE_TAIL)
-    usual = median(about_mean / (count - 1.0)[:, None])
-    if usual.all() and np.all((chi := np.sum(about_mean / usual, axis=1)) <= most):
-        return np.zeros(len(chi)), np.sqrt(chi / freedom)  # rounding makes the usual scatter larger
-    step = np.abs(np.diff(reading, axis=0))
+    usual = median(about_mean / (count - 1.0))
+
+    def chi_squares() -> Values:
+        return np.asarray(np.sum((about_mean / usual).reshape(len(pieces), -1, 3), axis=2))
+
+    if usual.all() and np.all((chi := chi_squares()) <= most):
+        return np.zeros(chi.shape), np.sqrt(chi / freedom)  # rounding makes the usual scatter larger
+    step = np.abs(np.diff(readings, axis=0))
     rounding = np.where(step > 0.0, step, np.inf).min(axis=0) ** 2 / 4.0  # between two counts
     usual = np.maximum(usual, rounding)
-    chi = np.sum(about_mean / usual, axis=1)
-    for piece in np.flatnonzero(chi > most):
-        start, stop = pieces[piece]
-        own = reading[start:stop]
-        alone = np.sum((own - own.mean(axis=0)) ** 2 / usual, axis=1) * count[piece] / (count[piece] - 1.0)
-        chi[piece] -= float(alone.max())
+    chi = chi_squares()
+    for piece, sensor in np.argwhere(chi > most):
+        (start, stop), of_sensor = pieces[piece], slice(3 * sensor, 3 * sensor + 3)
+        own = readings[start:stop, of_sensor]
+        squares = np.sum((own - own.mean(axis=0)) ** 2 / usual[of_sensor], axis=1)
+        chi[piece, sensor] -= float((squares * count[piece] / (count[piece] - 1.0)).max())
     return np.maximum(chi - most, 0.0), np.sqrt(chi / freedom)

@@ -35,11 +35,14 @@ PART_NAMES = {
     "lack_of_fit": LACK_OF_FIT,
     "wander_and_scatter": "bias wander and scatter of the rests",
 }
+PLAIN = {float, str, int, bool, type(None)}  # types of most values of a record, which JSON holds unchanged
 MONTE_CARLO = "monte_carlo"  # key of the run in a published budget
 
 
 def as_json(value: Any) -> Any:  # noqa: ANN401  (a record, or a value in one)
     """Return the JSON value of a record: its fields by name, arrays and tuples as lists."""
+    if type(value) in PLAIN:
+        return value
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if is_dataclass(value):

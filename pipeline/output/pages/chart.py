@@ -20,7 +20,7 @@ import re
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from html import escape
 from itertools import pairwise
 from typing import Any
@@ -45,6 +45,9 @@ BUCKETS = 140  # ranges drawn for more samples; about one in 2.4 px
 MAXIMUM_FULL = 20_000  # samples of a curve in a page (53 kB); of more samples, the ends of half as many buckets
 LARGE_DOTS, LARGE_MEANS = 300, 40  # dots, and dots with intervals, that have room to be large
 LETTER = 6.2  # px, width of a letter
+LARGEST_IN_TEXT = (
+    4999  # drawing units, in a chart up to 500 px high: a path of them is joined of texts that were made before
+)
 
 
 @lru_cache(64)  # the panels of a chart often have one axis
@@ -117,12 +120,14 @@ class Axis:
     def over(cls, arrays: Iterable[Values], start: float, stop: float, kind: str = "", margin: float = 0.04) -> Axis:
         """Return an axis over the finite values, wider by ``margin`` on both sides; 0 to 1 without any value."""
         values = scaled(np.concatenate([np.zeros(0), *(a.ravel() for a in arrays)]), kind)
-        finite = values[np.isfinite(values)]
-        low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+        values = values if np.isfinite(values).all() else values[np.isfinite(values)]
+        if not values.size:
+            return cls(0.0, 1.0, start, stop, kind)
+        low, high = float(values.min()), float(values.max())
         if high - low <= 1e-12 * max(abs(low), abs(high), 1e-300):
             half = 0.5 * abs(low) or 0.5
             return cls(low - half, high + half, start, stop, kind)
-        wider = margin * (high - low) if finite.size else 0.0
+        wider = margin * (high - low)
         return cls(low - wider, high + wider, start, stop, kind)
 
     def pixels(self, value: float) -> float:
@@ -132,7 +137,8 @@ class Axis:
 
     def units(self, values: Values) -> Integers:
         """Return the positions of values in whole drawing units; values beyond the axis are drawn at its end."""
-        v = np.minimum(np.maximum(scaled(values, self.kind), self.low), self.high)
+        v = np.maximum(scaled(values, self.kind) if "log" in self.kind else values, self.low)
+        np.minimum(v, self.high, out=v)
         v -= self.low
         v *= SUBDIVISION * (self.stop - self.start) / (self.high - self.low)
         v += SUBDIVISION * self.start
@@ -369,11 +375,13 @@ def _draw(layer: ChartLayer, x: Axis, y: Axis) -> str:
 
 def _samples(layer: SampleMarks, values: Values, x: Axis, y: Axis) -> str:
     """Return columns of samples, (n, k), as dots, or as the ranges of buckets."""
-    known = np.isfinite(values) & np.isfinite(layer.x)[:, None]
-    if (known != known[:, :1]).any():  # each column has samples of its own
-        each = enumerate(values.T, layer.colour)
-        return "".join(_samples(replace(layer, colour=c), v[:, None], x, y) for c, v in each)
-    known_x, known_y = layer.x[known[:, 0]], values[known[:, 0]]
+    known_x, known_y = layer.x, values
+    if not (np.isfinite(values).all() and np.isfinite(known_x).all()):
+        known = np.isfinite(values) & np.isfinite(layer.x)[:, None]
+        if (known != known[:, :1]).any():  # each column has samples of its own
+            each = enumerate(values.T, layer.colour)
+            return "".join(_samples(replace(layer, colour=c), v[:, None], x, y) for c, v in each)
+        known_x, known_y = layer.x[known[:, 0]], values[known[:, 0]]
     colours = range(layer.colour, layer.colour + values.shape[1])
     if len(known_x) <= MAXIMUM_DOTS:
         at, dots = x.units(known_x), y.units(known_y.T)
@@ -429,7 +437,22 @@ def _dots(x: Integers, y: Integers) -> str:
 
 def _path(form: str, *columns: Integers) -> str:
     """Return the form, filled once for each row of the columns."""
-    return form * len(columns[0]) % tuple(np.array(columns).T.ravel().tolist())
+    values = np.array(columns)
+    if not values.size or (values + LARGEST_IN_TEXT).view(np.uint64).max() > 2 * LARGEST_IN_TEXT:
+        return form * len(columns[0]) % tuple(values.T.ravel().tolist())
+    texts, zeros = _texts(form)
+    return texts.take(values.T + zeros).tobytes().translate(None, b"\0").decode()
+
+
+@cache
+def _texts(form: str) -> tuple[Integers, Integers]:
+    """Return each piece of a form filled with each number, as its eight bytes, and the index of the 0 of each piece."""
+    numbers = np.arange(-LARGEST_IN_TEXT, LARGEST_IN_TEXT + 1).astype("S5").view(np.uint8).reshape(-1, 5)
+    pieces = re.findall(r"(\D)%d(h0)?", form)
+    texts = np.zeros((len(pieces), len(numbers), 8), np.uint8)
+    for text, (letter, end) in zip(texts, pieces, strict=True):
+        text[:, 0], text[:, 1:6], text[:, 6 : 6 + len(end)] = ord(letter), numbers, list(end.encode())
+    return texts.view(np.int64).ravel(), LARGEST_IN_TEXT + len(numbers) * np.arange(len(pieces))
 
 
 def _names(points: Sequence[tuple[float, float, str]], x: Axis, y: Axis) -> str:

@@ -255,14 +255,17 @@ def step_and_noise(recording: Recording, sensor: str, rows: int | None = None) -
     The noise is the first quartile of the white noise of blocks, that of the quietest. ``rows``: that show the step.
     """
     unknown = np.full(3, np.inf)
-    values = np.asarray(recording.reading(sensor), order="F")  # numpy is fast along a contiguous axis
-    differences = np.abs(np.diff(values[np.isfinite(values).all(axis=1)], axis=0))
+    values = np.asarray(recording.reading(sensor))
+    if not (finite := np.isfinite(values)).all():
+        values = values[finite.all(axis=1)]
+    differences = np.abs(np.diff(np.asfortranarray(values), axis=0))  # numpy is fast along a contiguous axis
     count = len(differences) // DIFFERENCE_BLOCK
     if count < MIN_DIFFERENCE_BLOCKS:
         return unknown, unknown
     step = counts_of(differences[:rows])
-    blocks = differences[: count * DIFFERENCE_BLOCK].reshape(count, DIFFERENCE_BLOCK, 3)
-    squares, place = np.sort(np.mean(blocks**2, axis=1), axis=0), 0.25 * (count - 1)  # np.quantile is slow
+    blocks = differences[: count * DIFFERENCE_BLOCK].T.reshape(3, count, DIFFERENCE_BLOCK)
+    mean_squares = np.einsum("cbi,cbi->bc", blocks, blocks) / DIFFERENCE_BLOCK
+    squares, place = np.sort(mean_squares, axis=0), 0.25 * (count - 1)  # np.quantile is slow
     low = squares[int(place)]
     noise = np.sqrt(0.5 * (low + place % 1.0 * (squares[int(place) + 1] - low)))
     return np.where(step > 0.0, step, np.inf), noise
