@@ -386,6 +386,10 @@ class Certificate(Section):
     adjusted: Text = None
     next_date: Date = None
 
+    def number_of(self, unit: str, serial: str) -> str | None:
+        """Return the number of a unit's report."""
+        return self.number and self.number.replace("{unit}", unit).replace("{serial}", serial or "?")
+
 
 class Unit(Section):
     """The whole configuration of one unit, as its overrides state it."""

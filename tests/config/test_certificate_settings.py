@@ -35,3 +35,12 @@ def test_a_unit_takes_the_laboratory_of_its_row_and_keeps_its_hash(tmp_path: Pat
 def test_a_date_that_is_none_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"certificate\.issued"):
         load_campaign({"campaign": str(campaign(tmp_path, "issued: 1 March\n"))})
+
+
+@pytest.mark.parametrize("number", ["K-7", "K-7-{serial}"])
+def test_one_number_for_the_reports_of_two_units_is_refused(tmp_path: Path, number: str) -> None:
+    folder = campaign(tmp_path, f'number: "{number}"\n')
+    load_campaign({"campaign": str(folder)})
+    (folder / "units.csv").write_text("unit,certificate,serial\nU1,mine,\nU2,mine,\nU3,mine,12\n")
+    with pytest.raises(ConfigurationError, match="have one number; write"):
+        load_campaign({"campaign": str(folder)})

@@ -156,6 +156,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     if problems:
         lines = [f"  unit {', '.join(shortened(names, 5))}: {text}" for text, names in problems.items()]
         raise ConfigurationError("the configuration is refused:\n" + "\n".join(lines), str(directory / "units.csv"))
+    _check_report_numbers(units, str(directory / "units.csv"))
     of_run = run_settings(layers.of_run)
     batches, chains = cut_batches(units, None if of_run.batch_size == "auto" else of_run.batch_size)
     batch_of = {unit: batch for batch, members in batches.items() for unit in members}
@@ -172,6 +173,21 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         directory.name, directory, results, units, batches, chains, compare, layers.simulation, settings,
         layers.campaign.page, of_run.combine, of_run.publish_limit, _flag(settings.get(TAKE_OVER, False), TAKE_OVER),
     )  # fmt: skip
+
+
+def _check_report_numbers(units: Mapping[str, UnitRow], file: str) -> None:
+    """Refuse one number for the calibration reports of several units."""
+    reports: dict[str, list[str]] = {}
+    for name, unit in units.items():
+        if number := unit.config.certificate.number_of(name, unit.row.get("serial", "")):
+            reports.setdefault(number, []).append(name)
+    for number, names in reports.items():
+        if len(names) > 1:
+            raise ConfigurationError(
+                f"certificate.number={number}: the reports of units {', '.join(shortened(names, 5))} have one number; "
+                "write {unit} or {serial} in it, or state it for one unit in devices/<unit>.yaml",
+                file,
+            )
 
 
 def _flag(value: Any, name: str) -> bool:  # noqa: ANN401  (the user's)

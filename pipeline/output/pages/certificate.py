@@ -117,13 +117,11 @@ def certificate(
 def _administrative(calibration: JSON, stated: Certificate, row: JSON) -> JSON:
     serial, date = row.get("serial"), row.get("date") or ""
     begin = stated.performed.begin or (date if DAY.fullmatch(date) else None)
-    number = stated.number
     return {
         "dccSoftware": [{"name": n, "release": v} for n, v in (calibration.get("software") or {}).items()],
         "coreData": {
             "title": stated.title,
-            "uniqueIdentifier": number
-            and number.replace("{unit}", calibration["unit"]).replace("{serial}", serial or "?"),
+            "uniqueIdentifier": stated.number_of(calibration["unit"], serial),
             "countryCodeISO3166_1": stated.country,
             "usedLangCodeISO639_1": "en",
             "receiptDate": stated.received,
