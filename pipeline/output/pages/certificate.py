@@ -121,7 +121,7 @@ def _administrative(calibration: JSON, stated: Certificate, row: JSON) -> JSON:
         "dccSoftware": [{"name": n, "release": v} for n, v in (calibration.get("software") or {}).items()],
         "coreData": {
             "title": stated.title,
-            "uniqueIdentifier": stated.number_of(calibration["unit"], serial),
+            "uniqueIdentifier": stated.number_of(calibration["unit"], serial or ""),
             "countryCodeISO3166_1": stated.country,
             "usedLangCodeISO639_1": "en",
             "receiptDate": stated.received,
