@@ -12,6 +12,7 @@ resolution, and no run is flagged.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from imu_logs.clocks import bursts_error, rounded_error
 from imu_logs.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TABLE_CHANNELS, TRIADS
 from pipeline.core.errors import IngestError
-from pipeline.core.records import SENSOR_UNITS, Index, Integers, Mask, Note, median
+from pipeline.core.records import SENSOR_UNITS, Index, Integers, Mask, Note, Recording, median
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -79,6 +80,12 @@ def flag_gaps(table: Log, flags: NDArray[np.uint16], checks: Checks) -> list[Not
         error = IngestError(message, table.place(int(rows[np.argmax(lengths)])), code="missing_time", hint=hint)
         raise bursts_error(table) or rounded_error(table, error) or error
     return [table.note("N-GAP", rows, detail), *_irregular(table, steps[steps <= limit], usual)]
+
+
+def without_gaps(recording: Recording) -> Recording:
+    """Return a recording whose times are made, without the gaps between them."""
+    flags = None if recording.flags is None else recording.flags & ~GAP
+    return replace(recording, flags=flags, notes=tuple(note for note in recording.notes if note.code != "N-GAP"))
 
 
 def _irregular(table: Log, steps: Integers, usual: float) -> list[Note]:

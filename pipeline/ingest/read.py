@@ -49,7 +49,7 @@ from pipeline.ingest.axis_maps import STRAIGHT, axis_maps, axis_matrix, in_body_
 from pipeline.ingest.clock_alignment import unwrapped
 from pipeline.ingest.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.ingest.files import candidate_files
-from pipeline.ingest.quality_flags import examine
+from pipeline.ingest.quality_flags import examine, without_gaps
 from pipeline.ingest.recordings_sheet import require_recordings
 
 MAX_NAMED_FILES = 5  # further files that an error lists
@@ -97,6 +97,7 @@ def read_recordings(
             timeless = entry.kind == "attitudes"  # its rows have times of their own, which miss nothing
             allowed = checks.model_copy(update={"missing_time": 1.0}) if timeless else checks
             recording = to_recording(name, entry, table, sensor, allowed)
+            recording = without_gaps(recording) if timeless else recording
         except IngestError as error:
             refused.append(error)
             continue
@@ -302,7 +303,8 @@ def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, che
     starts = _starts(path, layouts[0], table.lines)
     number = np.cumsum(starts) - 1
     time = np.arange(len(starts)) * BETWEEN_ROWS_S + number * BETWEEN_ATTITUDES_S
-    notes = tuple(note for note in table.notes if note.code != "N-SYNTHTIME")
+    unused = f"columns not used: {LABEL}"  # which separates the attitudes
+    notes = tuple(note for note in table.notes if note.code != "N-SYNTHTIME" and note.detail != unused)
     table = replace(table, time_ns=np.rint(time * 1e9).astype(np.int64), notes=notes)
     if not starts.all():
         return table

@@ -99,7 +99,7 @@ def recordings_of_text(text: str, path: str) -> dict[str, RecordingFile]:
     """Return the recordings of the text of a sheet, by name; ``path`` stands for it in errors."""
     entries = [(line, _entry(row, path, line)) for line, row in _rows(text, path)]
     if not entries:
-        raise _refusal("no row names a file", path, 1)
+        raise _refusal("no row names a file; python -m pipeline check --campaign DIR proposes rows", path, 1)
     stems = [Path(entry.file).stem for _, entry in entries]
     found: dict[str, RecordingFile] = {}
     for (line, entry), stem in zip(entries, stems, strict=True):

@@ -3,9 +3,9 @@
     python tests/study/listed_recordings.py --kind turns --units 30 --seed 1
 
 The simulation uses no code of the package. It writes ``recordings.csv`` and its files, which are calibrated as by
-``pipeline.calibrate``, without a diagnosis, of which nothing is counted. A parameter is inside where the published
-value is within the published U of the truth. Parameters that the recordings determine and those held by the sensor file
-are counted apart.
+``pipeline.calibrate``. A parameter is inside where the published value is within the published U of the truth.
+Parameters that the recordings determine and those held by the sensor file are counted apart. With ``--diagnose`` units
+are counted in which no effect is selected that is not hidden, and nothing is unexplained.
 """
 
 from __future__ import annotations
@@ -268,7 +268,7 @@ KINDS = {
 }
 
 
-def run(number: int, *, kind: str, seed: int) -> dict[str, list[tuple[str, float, bool]]]:
+def run(number: int, *, kind: str, seed: int, diagnose: bool = False) -> dict[str, list[tuple[str, float, bool]]]:
     """Calibrate a unit; returns for each sensor parameter, error over U, and whether recordings determine it."""
     with tempfile.TemporaryDirectory() as name:
         unit = Unit(Path(name), np.random.default_rng([seed, number]))
@@ -280,11 +280,18 @@ def run(number: int, *, kind: str, seed: int) -> dict[str, list[tuple[str, float
         overrides += ["effects.gyroscope=auto"] if kind == "soak" else []
         chosen = {"sensor": "mpu6050", "table": where, "procedure": "listed", "method": None}
         configured = unit_without_campaign(unit.folder, chosen, overrides, ())
-        state = configured.run_to("validate")
-        state.diagnosed = SimpleNamespace(document={}, omissions=[])
+        state = configured.run_to("diagnose" if diagnose else "validate")
+        state.diagnosed = state.diagnosed if diagnose else SimpleNamespace(document={}, omissions=[])
+        document = state.diagnosed.document
         found = configured.run_to(first="calibration", state=state).calibration
     assert found is not None
     out: dict[str, list[tuple[str, float, bool]]] = {}
+    if diagnose:
+        parts = [
+            (part, unit.effects if sensor == "gyroscope" else {}) for sensor in LIMITS if (part := document[sensor])
+        ]
+        more = [n for part, hidden in parts for n in {*part["selected"]} - {*hidden} | {*map(str, part["unexplained"])}]
+        out["invented"] = [(name, np.inf, True) for name in more] or [("nothing", 0.0, True)]
     names = [f"bias_{a}" for a in "xyz"] + [f"matrix_{i}{j}" for i in "xyz" for j in "xyz"]
     for sensor in LIMITS:
         part = found[sensor]
@@ -315,14 +322,16 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--units", type=int, default=30)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--diagnose", action="store_true", help="also count what the diagnosis invents")
     parser.add_argument("--figures", type=Path, help="file for the shares with their 99 % intervals, clustered by unit")
     arguments = parser.parse_args(argv)
     kinds = [*KINDS] if arguments.kind == "all" else arguments.kind.split(",")
+    options = {"seed": arguments.seed, "diagnose": arguments.diagnose}
     with ProcessPoolExecutor(arguments.processes) as pool:
         figures = [
             figure
             for kind in kinds
-            for figure in told(kind, pool.map(partial(run, kind=kind, seed=arguments.seed), range(arguments.units)))
+            for figure in told(kind, pool.map(partial(run, kind=kind, **options), range(arguments.units)))
         ]
     if arguments.figures:
         write_figures(arguments.figures, figures)
@@ -334,7 +343,12 @@ def told(kind: str, units: Iterable[dict[str, list[tuple[str, float, bool]]]]) -
     counts: dict[tuple[str, str, str], list[float]] = {}
     by_unit: dict[bool, list[list[bool]]] = {True: [], False: []}
     named: list[bool] = []  # whether the effects of a soak are named, and no other
-    for found in units:
+    sound: list[bool] = []  # whether a diagnosis invents nothing
+    for number, found in enumerate(units):
+        invented = found.pop("invented", [])
+        sound += [not any(ratio for _, ratio, _ in invented)] if invented else []
+        for name in (name for name, ratio, _ in invented if ratio):
+            sys.stdout.write(f"{kind:16} unit {number} invents {name}\n")
         named += [ratio == 0.0 for _, ratio, _ in found.pop("effects", [])]
         for recorded, each in by_unit.items():
             each.append([abs(ratio) <= 1.0 for rows in found.values() for _, ratio, by in rows if by is recorded])
@@ -351,7 +365,10 @@ def told(kind: str, units: Iterable[dict[str, list[tuple[str, float, bool]]]]) -
         )
     if named:
         sys.stdout.write(f"{kind:16} effects named and no other: {sum(named)} of {len(named)}\n")
+    if sound:
+        sys.stdout.write(f"{kind:16} nothing invented: {sum(sound)} of {len(sound)}\n")
     return [
+        *share(f"{kind}: nothing invented", pd.Series(sound, dtype=bool), ">= 99 %"),
         *share(f"{kind}: effects named, and no other", pd.Series(named, dtype=bool), ">= 95 %"),
         *clustered_share(f"{kind}: determined by the recordings", by_unit[True], "contains 95 %"),
         *clustered_share(f"{kind}: held by the sensor file", by_unit[False], ">= 95 %"),

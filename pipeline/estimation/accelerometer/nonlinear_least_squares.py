@@ -46,7 +46,7 @@ from pipeline.core.records import (
 )
 from pipeline.core.settings import DataSheet, Settings
 from pipeline.estimation.engine import LinearMap, ScaledColumns
-from pipeline.estimation.gauss_markov import WHITE_SETTING, WanderPrior
+from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, WanderPrior
 from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
 from pipeline.estimation.multi_position.accelerometer import (
     PARAMETERS,
@@ -325,8 +325,9 @@ def _fitted(
     if (
         len(equations.residual) - len(PARAMETER_NAMES) <= 1
     ):  # too few rows to show a scatter: the prior of the wander replaces it
-        white = float(np.median(equations.error[: model.rests_equations]))
-        noises = [NoiseHypothesis(WHITE_SETTING, (prior.wander / white,))]
+        wander = Setting(prior.wander / float(np.mean(model.white)), prior.time)  # which rests of one file share
+        scatter = prior.wander / float(np.median(equations.error[: model.rests_equations]))
+        noises = [NoiseHypothesis(wander, (0.0,)) if rows.by_hand else NoiseHypothesis(WHITE_SETTING, (scatter,))]
     known_white = rows.rests.freedom > 0.0 or not np.any(rows.rests.own)  # by the scatter within the rests
     noises = [replace(noise, known=known_white) for noise in noises]
     fitted = fit_model(model, state, noises, {}, max(rows.rests.freedom, 1.0) if known_white else None)

@@ -33,6 +33,7 @@ import scipy
 
 from pipeline.core.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX, MATRIX_NAMES
 from pipeline.estimation.engine import cholesky, draw_normal
+from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
 from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, turns_of
 from pipeline.estimation.multi_position.model import (
@@ -436,6 +437,14 @@ def between_recordings(rests: Rests, turns: TurnsByHand | None, noise: Noise | N
         own = [rests.recording == name for name in names]
         means = np.array([np.average(rests.reading[k], axis=0, weights=rests.count[k]) for k in own]) / white
         within = np.mean([np.average(rests.share[k], weights=rests.count[k]) / np.count_nonzero(k) for k in own])
+        within += 0.0 if noise is None else np.mean([_wander_of_mean(rests.select(k), noise, white) for k in own])
         return float(np.sqrt(max(np.mean(np.var(means, axis=0, ddof=1)) - within, 0.0)))
     elsewhere = turns is not None and np.any(turns.recording != names[0])
     return float(np.sqrt(np.mean((noise.wander / white) ** 2))) if elsewhere and noise is not None else 0.0
+
+
+def _wander_of_mean(rests: Rests, noise: Noise, white: Values) -> float:
+    """Return the variance of the mean of a recording's rests by the bias wander, over that of white noise."""
+    weight = rests.count / rests.count.sum()
+    together = weight @ block_covariance(rests.start, rests.length, noise.correlation_time) @ weight
+    return float(together * np.mean((noise.wander / white) ** 2))

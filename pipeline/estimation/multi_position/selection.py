@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 import scipy
 
-from pipeline.core.records import Mask, Noise, SensorCalibration, Values
+from pipeline.core.records import Mask, Motion, Noise, SensorCalibration, Values
 from pipeline.core.settings import DataSheet
 from pipeline.estimation.candidates import NO_SWING, limits_of, starts_of, time_constants
 from pipeline.estimation.design import EffectColumns
@@ -39,13 +39,20 @@ from pipeline.estimation.multi_position.fit import (
     log_determinants,
     project_out,
 )
-from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, selection_hypotheses
+from pipeline.estimation.multi_position.model import (
+    Equations,
+    Model,
+    NoiseHypothesis,
+    State,
+    effect_readings,
+    selection_hypotheses,
+)
 from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import Score, without
 from pipeline.estimation.rest_means import Rests
 from pipeline.estimation.selection import MAX_SELECTED_EFFECTS
 from pipeline.physics.effects import catalogue, effect, effect_from
-from pipeline.physics.effects.base import Effect, Owner
+from pipeline.physics.effects.base import Effect, EffectParameter, Layout, Owner
 
 MAX_SELECTION_ROUNDS = 3 * MAX_SELECTED_EFFECTS
 POSSIBLE = 10.0  # times its limits, beyond which an effect is no explanation
@@ -54,6 +61,8 @@ DRIFT, LAG = "bias_drift", "temperature_lag"
 ONE_CYCLE = "the soak passes no temperature twice in one direction, so hysteresis looks like it: heat and cool twice"
 FEWEST_PARTS = 8  # of a soak that heats and cools
 TURNING = 0.2  # of the largest rate of the temperature: where it turns round
+# delta BIC of one curve above that of another: "positive" evidence (Raftery, Sociological Methodology 25, 1995)
+PREFERRED = 2.0
 COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to its optimum
 
 
@@ -156,13 +165,9 @@ class SelectionByHand:
 
     def _is_hysteresis(self) -> bool:
         """Return whether thermal hysteresis explains the soaks better than the lag that is selected."""
-        loop, lag = hysteresis_of(self.model), next(t for t in self.fit.state.terms if t.effect.name == LAG)
-        if loop is None:
-            return False
-        names = [name for name in self.names if name != LAG]
-        equations = self.model.equations(self._state(names), [lag, loop])
-        by_lag, by_loop = judged_curves(equations, self.hypotheses)
-        return by_loop[0] > by_lag[0]
+        state = self._state([name for name in self.names if name != LAG])
+        loops = loops_of(self.model, state.terms)
+        return bool(loops) and is_hysteresis(judged_curves(self.model.equations(state, loops), self.hypotheses))
 
     def _scored(self, names: Sequence[str]) -> CandidateScores:
         """Score every effect given base, configured and some of the selected effects."""
@@ -330,15 +335,50 @@ class SelectionByHand:
         return False
 
 
-def hysteresis_of(model: Model) -> EffectColumns | None:
-    """Return what thermal hysteresis adds to soaks that heat and cool, with the sign of dT/dt; None without any."""
+class CommonLag(Effect):
+    """The lag of a thermometer, by one time for all axes: ``z = tau dz_T/dT dT/dt`` with the effects z_T of a fit."""
+
+    name, owner, layout = "a lag common to all axes", Owner.SENSOR, Layout.SHARED
+
+    def __init__(self, terms: Sequence[EffectColumns]) -> None:
+        self.terms = terms
+
+    def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
+        """Return the time."""
+        del sensor
+        return (EffectParameter("tau", "s", self.name),)
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return the derivative by tau: (n, 3, 1) array."""
+        del values
+        assert motion.temperature is not None and motion.temperature_rate is not None  # noqa: S101, PT018
+        sides = [replace(motion, temperature=motion.temperature + step) for step in (0.5, -0.5)]  # degC
+        warmer, colder = (effect_readings(sensor, self.terms, side, K) for side in sides)
+        return np.asarray(((warmer - colder) * motion.temperature_rate[:, None])[:, :, None])
+
+
+def loops_of(model: Model, terms: Sequence[EffectColumns]) -> list[EffectColumns]:
+    """Return the curves of soaks that heat and cool: hysteresis, with the sign of dT/dt, and lag; empty without any.
+
+    ``terms``: effects of a fit.
+    """
     rate = (getattr(model, "soaks", None) or model.rests.select(model.rests.soaked)).temperature_rate
     cold = np.isnan(model.rests.temperature_rate).any()  # some recording holds no temperature
     if cold or not model.rests.swings or len(rate) < FEWEST_PARTS:
-        return None
-    terms = {"h": {"formula": f"tanh(temperature_rate / {TURNING * float(np.abs(rate).max())!r})", "unit": "1"}}
-    effect = {"name": "loop", "owner": "recording", "sensors": [model.sensor], "terms": terms, "meaning": "Hysteresis."}
-    return EffectColumns(effect_from(effect, "a test of the residual"), np.zeros(3))
+        return []
+    formula = {"h": {"formula": f"tanh(temperature_rate / {TURNING * float(np.abs(rate).max())!r})", "unit": "1"}}
+    own = {"name": "loop", "owner": "recording", "sensors": [model.sensor], "terms": formula, "meaning": "Hysteresis."}
+    loop = effect_from(own, "a test of the residual")
+    return [EffectColumns(loop, np.zeros(3)), EffectColumns(CommonLag(terms), np.zeros(1))]
+
+
+def is_hysteresis(judged: Sequence[tuple[float, float]]) -> bool:
+    """Return whether soaks show hysteresis rather than lag, by delta BIC and p of ``loops_of``.
+
+    Where the temperature rises and falls at one rate, a separate lag of each axis has the curve of hysteresis.
+    """
+    by_loop, by_lag = (delta for delta, _ in judged)
+    return by_loop > by_lag + PREFERRED
 
 
 def _nonlinear(candidate: Effect, sensor: str) -> Mask:

@@ -44,7 +44,7 @@ from pipeline.estimation.multi_position.fit import (
 )
 from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis
 from pipeline.estimation.multi_position.result import calibration_of
-from pipeline.estimation.multi_position.selection import LAG, SelectionByHand, hysteresis_of, posterior
+from pipeline.estimation.multi_position.selection import SelectionByHand, is_hysteresis, loops_of, posterior
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.observability import MORE_RESTS, never_shown, not_observable_by_hand, slow_by_hand
 from pipeline.estimation.rest_means import held_out_rests
@@ -55,7 +55,7 @@ from pipeline.evaluation.diagnosis.method_errors import given_differences
 from pipeline.evaluation.diagnosis.residual_dependence import added_variable_of_rests, significant
 from pipeline.evaluation.diagnosis.verdict import verdict_of_selection_by_hand
 from pipeline.evaluation.diagnosis.words import HYSTERESIS, listed, plain
-from pipeline.physics.effects import catalogue, effect, effect_from
+from pipeline.physics.effects import catalogue, effect_from
 
 NEEDED_RECORDING = MORE_RESTS
 WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"
@@ -63,9 +63,6 @@ LEAST_SPAN = 1.0  # s or degC: of a covariate
 FORCE = ("8 * u ** 4 - 8 * u ** 2 + 1", "16 * u ** 5 - 20 * u ** 3 + 5 * u")  # Chebyshev polynomials of u in g
 WORTH = 0.25  # least share of the residual's mean square that a possible cause explains at its limits
 MAX_NAMED_EFFECTS = 3  # effects in a sentence
-# delta BIC of one curve above that of another: "positive" evidence (Raftery, Sociological Methodology 25, 1995); of 30
-# accelerometers whose thermometer lags by 10 s it names hysteresis in none, by delta BIC > 10 alone in 4
-PREFERRED = 2.0
 FIRM = 2.0  # times the noise: a larger scatter of the rests is reported
 
 
@@ -292,8 +289,8 @@ def _dependences(selection: SelectionByHand) -> list[Dependence]:
     """Return the covariates on which the residual depends, the clearest first.
 
     Where that is heating against cooling, curves of time and temperature follow from it, and are left out. A lag of the
-    thermometer, which has a gate of its own, looks alike: hysteresis is named where its delta BIC is larger
-    by ``PREFERRED``, otherwise the covariates on which the residual depends beside the lag.
+    thermometer, which has a gate of its own, looks alike (``is_hysteresis``): if it is one, these are the covariates on
+    which the residual depends beside the lag.
     """
     model, rests = selection.model, selection.model.rests
     tests: list[tuple[str, Sequence[str]]] = []  # covariate and formulas of its curves
@@ -310,11 +307,10 @@ def _dependences(selection: SelectionByHand) -> list[Dependence]:
         own = {"name": f"curves_of_{covariate}", "owner": "recording", "sensors": [model.sensor], "terms": terms}
         definition = effect_from({**own, "meaning": "Curves."}, "a test of the residual")
         curves.append(EffectColumns(definition, np.zeros(3 * len(formulas))))
-    loop = hysteresis_of(model)
-    if loop is not None:
-        tests.append((HYSTERESIS, ()))
-        curves += [loop, EffectColumns(effect(LAG), np.zeros(3))]
-    equations = model.equations(selection.fits[-1].state, curves)
+    state = selection.fits[-1].state
+    loops = loops_of(model, state.terms)
+    tests += [(HYSTERESIS, ())] if loops else []
+    equations = model.equations(state, [*curves, *loops])
     possible = selection.ceilings > selection.fits[-1].log_likelihood - CEILING_TO
     hypotheses = [selection.hypotheses[i] for i in np.flatnonzero(possible)]
 
@@ -326,8 +322,7 @@ def _dependences(selection: SelectionByHand) -> list[Dependence]:
     found = dependences(judged)
     if HYSTERESIS not in [each.covariate for each in found]:
         return found
-    by_loop, by_lag = (delta for delta, _ in judged[-2:])
-    if by_loop < by_lag + PREFERRED:
+    if not is_hysteresis(judged[-2:]):
         *others, _, lag = equations.candidates
         given = replace(equations, effects=[*equations.effects, lag], candidates=others)
         return dependences(judged_curves(given, hypotheses))

@@ -17,7 +17,20 @@ from pipeline.core.errors import InputError, NotObservableError
 from pipeline.core.records import SensorCalibration
 from pipeline.physics.compensation import load
 from pipeline.physics.statements import not_determined
-from tests.study.listed_recordings import Unit, at_rest, joined, on_table, run, table, turned
+from tests.study.listed_recordings import (
+    RATE_HZ,
+    TAU_S,
+    WANDER,
+    WHITE,
+    Unit,
+    at_rest,
+    joined,
+    on_table,
+    rotation,
+    run,
+    table,
+    turned,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -301,6 +314,9 @@ def test_blocks_of_rows_with_a_label_are_attitudes(tmp_path: Path) -> None:
     unit.sheet()
     found = calibrated(tmp_path).calibration
     assert found["accelerometer"]["stages"][0]["details"]["orientations_used"] == 12
+    (file,) = found["inputs"]
+    assert file["missing_s"] == 0.0
+    assert {note["code"] for note in file["notes"]} == {"N-ABSENT"}  # the label is used, and its rows miss no time
     assert np.abs(errors(unit, found, "accelerometer")).max() < 1.2
 
 
@@ -469,6 +485,67 @@ def test_a_lag_below_its_gate_is_no_hysteresis(tmp_path: Path) -> None:
     found = calibrated(tmp_path, "effects.gyroscope=auto").diagnosis["gyroscope"]
     assert found["selected"] == ["bias_temperature"]
     assert found["unexplained"] == []
+
+
+def test_the_wander_of_soaks_is_no_difference_between_them_too(tmp_path: Path) -> None:
+    """The means of two soaks differ by the wander, which counted a second time as a bias that differs between files."""
+    unit, seconds = Unit(tmp_path, np.random.default_rng(8)), 4000.0
+    for number in range(2):
+        n = round(seconds * 5.0)
+        warm = 20.0 * np.sin(2.0 * np.pi * np.arange(n) / n)
+        still = np.tile([0.0, 0.0, 1.0], (n, 1)), np.zeros((n, 3))
+        unit.write(f"soak_{number}", "soak,,,,", *still, warmth=25.0 + warm, hz=5.0, between=0.0)
+    unit.sheet()
+    part = calibrated(tmp_path, "effects.gyroscope=[bias_temperature]").calibration["gyroscope"]
+    x = seconds / TAU_S
+    # 20 independent values of 3 axes in 2 soaks show a variance to sqrt(2 / 120) = 13 %; three times that of U
+    of_mean = WANDER["gyroscope"] * np.sqrt(2.0 * (x - 1.0 + np.exp(-x))) / x  # of an exponential autocorrelation
+    assert np.mean(part["standard_uncertainty"]["bias"]) == pytest.approx(of_mean / np.sqrt(2.0), rel=0.2)
+
+
+def test_rests_of_one_file_share_the_wander_where_they_are_as_many_as_parameters(tmp_path: Path) -> None:
+    """Against the covariance of the exact equations ``|M (y - b)| = 1`` with white noise and the wander."""
+    unit, rng, seconds = Unit(tmp_path, np.random.default_rng(2)), np.random.default_rng(3), 10.0
+    up, middle = [], []
+    for number in range(5):
+        start, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        end = rotation(axis, np.array([-np.radians(150.0)]))[0] @ start
+        turn = turned(150.0, 60.0, axis, start)
+        parts = joined(at_rest(seconds, start), turn, at_rest(seconds, end))
+        unit.write(f"two_{number}", "moves,,,,", *parts, "a")
+        up += [start, end]
+        middle += [0.0, seconds + len(turn[0]) / RATE_HZ]
+    unit.sheet()
+    part = calibrated(tmp_path).calibration["accelerometer"]
+    assert set(np.ravel(part["determined_by"]["bias"])) == {"recordings"}
+    M, K = unit.frame() @ np.linalg.inv(unit.K["accelerometer"]), unit.K["accelerometer"]
+    f = np.array(up) @ unit.frame().T
+    by_matrix = np.einsum("ni,nj->nij", f, np.array(up) @ K.T)[:, *np.tril_indices(3)]
+    J = np.concatenate([-f @ M, by_matrix], axis=1)
+    apart, file = np.abs(np.subtract.outer(middle, middle)), np.arange(10) // 2
+    together = np.where(np.equal.outer(file, file), np.exp(-apart / TAU_S), 0.0) * ((f @ M) @ (f @ M).T)
+    of_white = WHITE["accelerometer"] ** 2 / (RATE_HZ * seconds) * np.sum((f @ M) ** 2, axis=1)
+    C = WANDER["accelerometer"] ** 2 * together + np.diag(of_white)
+    expected = np.sqrt(np.diag(np.linalg.inv(J.T @ np.linalg.solve(C, J))))
+    assert part["standard_uncertainty"]["bias"] == pytest.approx(expected[:3].tolist(), rel=0.1)
+
+
+@pytest.mark.parametrize("lag", [0.0, 30.0])
+def test_a_lag_is_told_from_hysteresis_where_the_temperature_moves_at_one_rate(tmp_path: Path, lag: float) -> None:
+    """There both have one curve; but a thermometer lags by one time for all axes."""
+    rng, n, b_T = np.random.default_rng(15), 4800, np.array([0.01, -0.02, 0.03])
+    die = np.interp(np.arange(n) / n, [0.0, 0.2, 0.3, 0.65, 0.75, 0.95, 1.0], [0.0, 25.0, 25.0, -25.0, -25.0, 0.0, 0.0])
+    keep = np.exp(-1.0 / lag) if lag else 0.0
+    warm = scipy.signal.lfilter([1.0 - keep], [1.0, -keep], die)
+    loop = 0.0 if lag else 0.03 * np.outer(np.sign(np.gradient(die)), [1.0, 1.0, 1.0])
+    gyro = np.outer(die, b_T) + loop + [0.5, -1.0, 2.0] + 5e-3 * np.sqrt(0.5) * rng.normal(size=(n, 3))
+    header = "time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,temperature_degc"
+    rows = np.column_stack([np.arange(float(n)), gyro, 25.0 + warm])
+    np.savetxt(tmp_path / "soak.csv", rows, fmt="%.8g", delimiter=",", header=header, comments="")
+    (tmp_path / "recordings.csv").write_text("file,kind\nsoak.csv,soak\n")
+    found = calibrated(tmp_path, "effects.gyroscope=auto").diagnosis["gyroscope"]
+    assert ("temperature_lag" in found["selected"]) is bool(lag)
+    assert [each["covariate"] for each in found["unexplained"]] == ([] if lag else ["temperature_hysteresis"])
 
 
 def test_rows_beyond_the_soaked_temperatures_are_marked_or_refused(tmp_path: Path) -> None:
