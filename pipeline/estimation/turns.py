@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,8 @@ from pipeline.estimation.engine import ResidualNoise, ScaledColumns
 from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.physics.effects.base import length
-from pipeline.physics.kinematics import Pieces, table_motion
+from pipeline.physics.encoder_trajectory import Pieces
+from pipeline.physics.kinematics import table_motion
 from pipeline.physics.signal.rests import RATE_AT_REST_DPS, runs
 
 FIT_BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
@@ -325,15 +327,17 @@ class RowGroups:
         pieces = self._pieces
         if isinstance(offset, np.ndarray):
             offset = np.repeat(offset, np.diff(np.append(pieces.of_row, len(pieces.first))))
-        moved, before, found = trajectory(offset=offset, rows=pieces, **lag), logged(), {}
+        moved = trajectory(offset=offset, rows=pieces, **lag)
         assert moved is not None  # noqa: S101
-        for name in MOVED_FIELDS:
+
+        def later(name: str) -> Values:
             values, mean = getattr(moved, name), getattr(here, name)
             long = self.count.reshape(-1, *[1] * (mean.ndim - 1)) > ALL_SAMPLES
-            found[name] = values + np.where(long, mean - getattr(before, name), 0.0)
-        return self._with_trajectory(
-            here.changed(**found, reference_valid=moved.reference_valid), moved, partial(self._mean_at, here, logged)
-        )
+            return np.asarray(values + np.where(long, mean - getattr(logged(), name), 0.0))
+
+        found: dict[str, Any] = {name: partial(later, name) for name in MOVED_FIELDS}
+        found["reference_valid"] = lambda: moved.reference_valid
+        return self._with_trajectory(here.changed(**found), moved, partial(self._mean_at, here, logged))
 
 
 def _step(motion: Motion) -> float:

@@ -40,8 +40,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 import scipy
 
+from pipeline.core.records import attitude_matrix
 from pipeline.core.settings import ProgramRest, ProgramTurn
-from pipeline.physics.kinematics import attitude_matrix, level_at_zero, turn_by_vector
+from pipeline.physics.kinematics import level_at_zero, turn_by_vector
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -9,10 +9,10 @@ from table_turns import Bench, run_stages, settings, specific_force
 from unit_settings import filter_of
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
-from pipeline.core.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
+from pipeline.core.records import Recording, SensorCalibration, UnitRecordings, attitude_matrix, coverage_factor
 from pipeline.estimation.reference_least_squares import fit
 from pipeline.estimation.stages import StageInput
-from pipeline.physics.kinematics import attitude_matrix, reference_motion
+from pipeline.physics.kinematics import reference_motion
 from pipeline.physics.signal.filters import apply_filter
 
 if TYPE_CHECKING:

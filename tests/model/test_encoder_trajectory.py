@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.ingest.commanded_motion import Program
-from pipeline.physics.kinematics import EncoderTrajectory, nearest_slope
+from pipeline.physics.encoder_trajectory import EncoderTrajectory, nearest_slope
 from pipeline.simulation.trajectory import rest, turn_with_plateau
 
 

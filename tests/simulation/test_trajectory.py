@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.core.records import attitude_matrix
 from pipeline.ingest.commanded_motion import Program
-from pipeline.physics.kinematics import UP_AT_ZERO, attitude_matrix, turn_about_axis
+from pipeline.physics.kinematics import UP_AT_ZERO, turn_about_axis
 from pipeline.simulation.description import Course, plan
 from pipeline.simulation.trajectory import (
     CommandedTurns,

@@ -50,8 +50,11 @@ MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise with standard d
 
 
 SPLINE_PART, SPLINE_MARGIN = 50_000, 100  # samples
-# Of a motion: with three axes, they follow from the log, and would have most of a long recording's memory.
-DEFERRED = "specific_force", "angular_rate", "angular_acceleration", "specific_force_rate", "level", "direction"
+# Of a motion: they follow from the log. Those with three axes would have most of a long recording's memory.
+DEFERRED = (
+    *("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate", "level", "direction"),
+    *("angle", "rate", "reference_valid"),
+)
 
 
 class Quantities(dict["Hashable", Any]):
@@ -364,14 +367,14 @@ class Motion:
         return Motion(**{**vars(self), **fields})
 
     def mapped(self, change: Callable[[NDArray[Any]], NDArray[Any]], **fields: Any) -> Motion:  # noqa: ANN401
-        """Return the motion with every array changed, deferred where it has three axes, and with other fields."""
+        """Return the motion with every array changed, those of ``DEFERRED`` later, and with other fields."""
 
         def later(name: str) -> NDArray[Any]:
             value = vars(self)[name]  # not by the attribute, which would keep the values of all samples
             return change(value() if callable(value) else value)
 
         arrays = {n: v for n, v in vars(self).items() if isinstance(v, np.ndarray) and n not in {*DEFERRED, *fields}}
-        deferred = {name: partial(later, name) for name in DEFERRED if vars(self)[name] is not None}
+        deferred = {n: partial(later, n) for n in DEFERRED if n not in fields and vars(self)[n] is not None}
         return self.changed(**{n: change(v) for n, v in arrays.items()}, **deferred, **fields)
 
     def select(self, index: NDArray[Any]) -> Motion:
@@ -404,6 +407,17 @@ def continuous(attitude: NDArray[np.float64]) -> NDArray[np.float64]:
 def conjugate_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the vector part of ``conj(p) q`` for quaternions of shape (n, 4): (n, 3)."""
     return p[:, :1] * q[:, 1:] - q[:, :1] * p[:, 1:] - cross(p[:, 1:], q[:, 1:])
+
+
+def attitude_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation matrices of unit quaternions: (n, 4) to (n, 3, 3), body vectors to level vectors."""
+    w, x, y, z = q.T
+    rows = (
+        *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        *(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        *(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return np.stack(rows, axis=1).reshape(-1, 3, 3)
 
 
 def level_in_body(q: NDArray[np.float64]) -> NDArray[np.float64]:

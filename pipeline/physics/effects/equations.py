@@ -38,8 +38,9 @@ import numpy as np
 from pipeline.core.records import Motion, Values
 from pipeline.physics.effects.base import Layout, every_axis, length, truth, truth_rate, turning_direction
 from pipeline.physics.effects.formula_effect import DeclaredEffect
+from pipeline.physics.encoder_trajectory import NODES, WEIGHTS
 from pipeline.physics.formula import c_number
-from pipeline.physics.kinematics import ABOUT, NODES, UP_AT_ZERO, WEIGHTS, skew, turn_about_axis
+from pipeline.physics.kinematics import ABOUT, UP_AT_ZERO, skew, turn_about_axis
 
 VERTICAL_SINE = 0.5  # sine of the elevation of the turn axis, which is 0 (level axis) or 1 (vertical axis)
 SIGNS = np.array([[1.0], [-1.0]])  # of d_x and d_y in the equation above
@@ -227,7 +228,7 @@ def shifted(motion: Motion, offset: float | Values) -> Motion:
 def _seen_from(motion: Motion, moved: Motion | None) -> Motion:
     """Return a moved motion with the rests and directions of the logged motion."""
     assert moved is not None  # noqa: S101
-    return replace(moved, still=motion.still, direction=motion.direction)
+    return moved.changed(still=motion.still, direction=motion.direction)
 
 
 class _Timing(DeclaredEffect):
