@@ -587,13 +587,13 @@ def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, 
     (..., r), the rounding error e of each curve.
     """
     explained, independent = np.zeros_like(cross), np.zeros(error.shape, bool)
-    for j in range(inner.shape[-1]):
-        pivot = inner[..., j, j]
-        independent[..., j] = new = pivot > error[..., j] ** 2
+    for j in range(inner.shape[-1]):  # what is left holds the curves from j on
+        pivot = inner[..., 0, 0]
+        independent[..., j] = new = pivot > error[..., 0] ** 2
         over = np.where(new, 1.0 / np.where(new, pivot, 1.0), 0.0)
-        explained[..., j, :] = cross[..., j, :] ** 2 * over[..., None]
-        taken = inner[..., j] * over[..., None]
-        cross = cross - taken[..., None] * cross[..., j, None, :]
-        inner = inner - taken[..., None] * inner[..., j, None, :]
-        error = error + np.abs(taken) * error[..., j, None]
+        explained[..., j, :] = cross[..., 0, :] ** 2 * over[..., None]
+        taken = inner[..., 1:, 0] * over[..., None]
+        cross = cross[..., 1:, :] - taken[..., None] * cross[..., 0, None, :]
+        inner = inner[..., 1:, 1:] - taken[..., None] * inner[..., 0, None, 1:]
+        error = error[..., 1:] + np.abs(taken) * error[..., 0, None]
     return explained, independent
