@@ -13,7 +13,7 @@ that of a static recording or of the sensor file, two effects may mask each othe
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -65,8 +65,8 @@ def select(
     """
     observations, grid = weighted(observations, noise), selection_grid(noise)
 
-    def searched(observations: Observations) -> Selection:
-        """Select effects by all rows of the observations."""
+    def searched(observations: Observations, near: Mapping[tuple[str, ...], JointFit]) -> Selection:
+        """Select effects by all rows of the observations; ``near``: fits to most of them, from which fits start."""
         starts, candidates = starts_of(configured, observations, known, accelerometer), {}
         for this in candidates_for(observations, configured):
             prior = prior_of(this, observations, accelerometer, configured)
@@ -75,24 +75,27 @@ def select(
             )
         models = [[*candidates.values()], *starts]
         key = select, tuple(tuple(term.key for term in terms) for terms in models), data_sheet.model_dump_json(), search
-        return observations.once(key, lambda: selected(observations, starts, candidates))
+        return observations.once(key, lambda: selected(observations, starts, candidates, near))
 
     def selected(
-        observations: Observations, starts: list[list[EffectColumns]], candidates: dict[str, EffectColumns]
+        observations: Observations,
+        starts: list[list[EffectColumns]],
+        candidates: dict[str, EffectColumns],
+        near: Mapping[tuple[str, ...], JointFit],
     ) -> Selection:
         start, limits = ordinary_base(observations, noise), limits_of(observations.sensor, data_sheet)
         base = fit_best(observations, starts, start, grid)
         ranking = Ranking(observations, base, base, candidates, grid)
         selection = Selection(
-            observations, noise, data_sheet, start, grid, limits, candidates, base, base, ranking, ranking
+            observations, noise, data_sheet, start, grid, limits, candidates, base, base, ranking, ranking, near=near
         )
         if search:
             selection.run()
         return selection
 
-    selection = searched(observations)
+    selection = searched(observations, {})
     remaining = without_unknown_motion(observations, selection.fit.terms)
-    return selection if remaining is observations else searched(remaining)
+    return selection if remaining is observations else searched(remaining, selection.fits)
 
 
 @dataclass
@@ -114,6 +117,7 @@ class Selection:
     alone: dict[str, Score] = field(default_factory=dict)  # of each candidate against the base
     fits: dict[tuple[str, ...], JointFit] = field(default_factory=dict)  # of base, configured and further effects
     optima: dict[Hashable, JointFit] = field(default_factory=dict)  # of candidates, by all terms at the start
+    near: Mapping[tuple[str, ...], JointFit] = field(default_factory=dict)  # fits from which those of ``fits`` start
     refused: set[frozenset[str]] = field(default_factory=set)  # sets with a time constant that is not determined
 
     @property
@@ -210,7 +214,7 @@ class Selection:
         terms = [*self.base.terms, *self._terms(), EffectColumns(this, values)]
         key = tuple(term.key for term in terms)
         if key not in self.optima:
-            fit = fit_terms(self.observations, terms, self.start, self.settings)
+            fit = self._fitted((*self.names, score.name), terms, self.start)
             self.optima[key] = replace(fit)  # without its design: there are many candidates
         self.fits[*self.names, score.name] = fit = self.optima[key]
         before, _ = self.ranking.of_model(self.ranking.of_effects(self.names))
@@ -284,8 +288,16 @@ class Selection:
         key = tuple(self.names)
         if key not in self.fits:
             terms = [*self.base.terms, *self._terms()]
-            self.fits[key] = fit_terms(self.observations, terms, self.fit, self.settings)
+            self.fits[key] = self._fitted(key, terms, self.fit)
         self.fit = self.fits[key]
+
+    def _fitted(self, names: tuple[str, ...], terms: Sequence[EffectColumns], start: Start) -> JointFit:
+        """Fit terms from a start, or from the fit of the same effects that is known to be near."""
+        if (near := self.near.get(names)) is not None:
+            values = {term.effect.name: term.values for term in near.terms}
+            terms = [replace(term, values=values[term.effect.name]) for term in terms]
+            start = Start(near.bias, near.K, start.scale)
+        return fit_terms(self.observations, terms, start, self.settings)
 
     def _terms(self) -> list[EffectColumns]:
         """Return the selected effects at their fitted values, or at those of the step that accepted them."""

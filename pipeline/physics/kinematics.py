@@ -20,7 +20,7 @@ Earth's rotation (15.041 deg/h) is added to omega where latitude and azimuth are
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -224,26 +224,19 @@ def _motion_of_attitude(
     def at(before: float | Values, offset: float | Values = 0.0) -> Motion:
         offset = before + offset
         table_time = (time + offset) * clock
-        q = spline(table_time) if np.any(offset) else attitude
-        omega = np.degrees(2.0 * conjugate_product(q, spline(table_time, 1)))
-
+        q = cache(lambda: spline(table_time) if np.any(offset) else attitude)
+        omega = cache(lambda: np.degrees(2.0 * conjugate_product(q(), spline(table_time, 1))))
         deferred: dict[str, Any] = {
-            "specific_force": lambda: gravity_g * level_in_body(q),
-            "angular_rate": lambda: omega if earth is None else omega + earth_in_body(earth, attitude_matrix(q)),
-            "angular_acceleration": lambda: np.degrees(2.0 * conjugate_product(q, spline(table_time, 2))),
-            "specific_force_rate": lambda: gravity_g * cross(level_in_body(q), np.radians(omega)),
-            "level": partial(attitude_matrix, q),
+            "specific_force": lambda: gravity_g * level_in_body(q()),
+            "angular_rate": lambda: omega() if earth is None else omega() + earth_in_body(earth, attitude_matrix(q())),
+            "angular_acceleration": lambda: np.degrees(2.0 * conjugate_product(q(), spline(table_time, 2))),
+            "specific_force_rate": lambda: gravity_g * cross(level_in_body(q()), np.radians(omega())),
+            "level": lambda: attitude_matrix(q()),
+            "still": lambda: still_samples(time, np.linalg.norm(omega(), axis=1)),
         }
         return logged(
             Motion(
-                time=time,
-                temperature=None,
-                angle=None,
-                rate=None,
-                axis=None,
-                still=still_samples(time, np.linalg.norm(omega, axis=1)),
-                at_offset=partial(at, offset),
-                **deferred,
+                time=time, temperature=None, angle=None, rate=None, axis=None, at_offset=partial(at, offset), **deferred
             )
         )
 

@@ -53,7 +53,7 @@ SPLINE_PART, SPLINE_MARGIN = 50_000, 100  # samples
 # Of a motion: they follow from the log. Those with three axes would have most of a long recording's memory.
 DEFERRED = (
     *("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate", "level", "direction"),
-    *("angle", "rate", "reference_valid"),
+    *("angle", "rate", "still", "reference_valid"),
 )
 
 

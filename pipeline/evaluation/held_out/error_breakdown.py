@@ -134,11 +134,19 @@ def errors_of(calibrations: Sequence[SensorCalibration], samples: Sequence[Sampl
 
     (c, n, 3), of the vector, if all samples have its direction, else (c, n, 1), of the magnitude.
     """
-    found = [[with_known_effects(calibration, each) for each in samples] for calibration in calibrations]
-    directed = all(true is not None for of_one in found for _, _, true in of_one)
-    errors = np.array([vector_errors(of_one, directed=directed) for of_one in found])
-    known = np.concatenate([each.known for each in samples]) & np.isfinite(errors).all(axis=(0, 2))
-    return errors[:, known], np.concatenate([each.time for each in samples])[known]
+
+    def of(calibration: SensorCalibration, *, directed: bool) -> Values:
+        found = [with_known_effects(calibration, each) for each in samples]
+        return vector_errors(found, directed=directed and all(true is not None for _, _, true in found))
+
+    errors = [of(calibration, directed=True) for calibration in calibrations]  # one by one: they may have 100 MB each
+    if len({each.shape[1] for each in errors}) > 1:
+        errors = [of(calibration, directed=False) for calibration in calibrations]
+    known = np.concatenate([each.known for each in samples])
+    for each in errors:
+        known &= np.isfinite(each).all(axis=1)
+    time = np.concatenate([each.time for each in samples])
+    return np.stack(errors if known.all() else [each[known] for each in errors]), time[known]
 
 
 def vector_errors(corrected: Sequence[Corrected], *, directed: bool) -> Values:

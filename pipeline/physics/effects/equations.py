@@ -31,7 +31,9 @@ turn's rate is exact; the lag of other signals is a Gauss-Laguerre sum, exact fo
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -311,5 +313,9 @@ class LowPassLag(_Timing):
             return _seen_from(motion, motion.at_lag(lag=float(values[0])))
         nodes = [shifted(motion, -values[0] * node) for node in NODES]
         names = ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate")
-        means = {name: sum(w * getattr(n, name) for w, n in zip(WEIGHTS, nodes, strict=True)) for name in names}
-        return replace(motion, **means, at_offset=lambda offset=0.0: self.moved(shifted(motion, offset), values))
+
+        def mean(name: str) -> Values:
+            return np.asarray(sum(w * getattr(n, name) for w, n in zip(WEIGHTS, nodes, strict=True)))
+
+        means: dict[str, Any] = {name: partial(mean, name) for name in names}
+        return motion.changed(**means, at_offset=lambda offset=0.0: self.moved(shifted(motion, offset), values))
