@@ -54,9 +54,9 @@ from pipeline.estimation.multi_position.accelerometer import (
     limit_of_misalignment,
     limits_of_parameters,
 )
-from pipeline.estimation.multi_position.fit import FitByHand, with_limits
+from pipeline.estimation.multi_position.fit import FitByHand
 from pipeline.estimation.multi_position.fit import fit as fit_model
-from pipeline.estimation.multi_position.model import NoiseHypothesis, State, prior_hypotheses
+from pipeline.estimation.multi_position.model import NoiseHypothesis, State, prior_hypotheses, with_limits
 from pipeline.estimation.multi_position.result import (
     NOT_INCLUDED,
     after_stage,

@@ -41,10 +41,10 @@ from pipeline.core.records import (
 from pipeline.core.settings import Procedure
 from pipeline.estimation.effects import accelerometer_of, frame_error
 from pipeline.estimation.engine import ScaledColumns
-from pipeline.estimation.multi_position.fit import MIN_NEW_NORM_SHARE, FitByHand, with_limits
+from pipeline.estimation.multi_position.fit import MIN_NEW_NORM_SHARE, FitByHand
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.gyroscope import MIN_MOVES, GyroscopeModel, model_of
-from pipeline.estimation.multi_position.model import State, prior_hypotheses
+from pipeline.estimation.multi_position.model import State, prior_hypotheses, with_limits
 from pipeline.estimation.multi_position.moves import clipped_moves
 from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.rest_means import ROLE, advice_on_held_out, is_multi_position, rests_of

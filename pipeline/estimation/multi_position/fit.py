@@ -40,12 +40,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
-from pipeline.core.errors import CannotCalibrateError, NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
 from pipeline.estimation.engine import ErrorMixture
@@ -54,7 +54,7 @@ from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypo
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.core.records import Mask, Values
+    from pipeline.core.records import Values
 
     Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
 
@@ -66,7 +66,6 @@ REDUNDANT_RESTS = 10  # that are recommended beyond the parameters, so that resi
 NEGLIGIBLE_LOG_LIKELIHOOD = 12.0  # of log L below the best: a weight of 6e-6
 PREDICTED_TO = 4.0  # of log L by a linear model: 9 of 10 fits of 13 simulated units differ by less than 0.5
 CEILING_TO = 1.0  # of log L without a residual, which changes by up to 0.02 between fits of these units
-Fitted = TypeVar("Fitted")
 MAX_GAUSS_NEWTON_ITERATIONS = 60  # of Gauss-Newton
 FAR_ROUNDS = 9  # 99 % of 273 simulated fits need no more
 SMALL_LAST_STEP = 3e-3  # of a standard uncertainty: the last step taken
@@ -304,8 +303,19 @@ class FitByHand:
 
     @property
     def degrees_of_freedom(self) -> Values:
-        """Of each parameter: (b + p,) array."""
-        return self._averaged[1]
+        """Of each parameter: (b + p,) array.
+
+        The means of f recordings show the bias between them with 3 (f - 1); both are combined (GUM, G.4.1).
+        """
+        freedom, files = self._averaged[1], self.equations.files
+        if self.equations.between is None or files < 2:
+            return freedom
+        solved, p = self._every[1][self._likeliest], len(self.precision)
+        together = np.concatenate([self.equations.columns, self.equations.between], axis=1)
+        white, _ = self.equations.whitened(self.noise, together)
+        change = solved.covariance @ white[:, :p].T @ white[:, p:] / solved.scale
+        share = np.minimum(np.sum(change**2, axis=1) / np.maximum(np.diag(self.covariance), 1e-300), 1.0)
+        return np.asarray(1.0 / (share**2 / (3.0 * (files - 1)) + (1.0 - share) ** 2 / freedom))
 
     @property
     def hypotheses(self) -> list[tuple[NoiseHypothesis, float, float]]:
@@ -568,32 +578,3 @@ def require_observable(model: Model, fitted: FitByHand, limits: Limits) -> None:
             f"the rests of the {model.sensor} do not determine {', '.join([e.name for e in lost] or loose)}: {advice}; "
             f"or take it out of effects.{model.sensor}"
         )
-
-
-def with_limits(
-    limits: Mapping[str, float], solve_with: Callable[[Mapping[str, float]], tuple[Fitted, Values]]
-) -> Fitted:
-    """Fit with pseudo-observations of those parameters that the recordings determine worse than the sensor file.
-
-    A parameter keeps its pseudo-observation where its variance is more than half of that of its limit, or without one
-    more than all of it: it is then mostly the limit's. ``limits``: name to standard uncertainty. ``solve_with``: fits
-    with some of them, and returns the fit and the standard uncertainties of all; raises an error if they leave a
-    combination open.
-    """
-    u = np.array(list(limits.values()))
-
-    def held(kept: Mask) -> Mapping[str, float]:
-        return {name: limit for name, limit, k in zip(limits, u.tolist(), kept, strict=True) if k}
-
-    every, known = solve_with(held(np.ones(len(u), bool)))
-    kept = known > u * np.sqrt(0.5)
-    while not kept.all():
-        try:
-            found, known_now = solve_with(held(kept))
-        except (NotObservableError, CannotCalibrateError):
-            known_now = known
-        else:
-            if not np.any(~kept & (known_now > u)):
-                return found
-        kept[int(np.argmax(np.where(kept, 0.0, known_now / u)))] = True
-    return every

@@ -31,11 +31,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 import scipy
 
+from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.core.records import BIAS, Index, Mask, Motion, Noise, Values, base_values, matrix_of
 from pipeline.estimation import design
 from pipeline.estimation.engine import cholesky
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
 
 Model: TypeAlias = "AccelerometerModel | GyroscopeModel"
 
+Fitted = TypeVar("Fitted")
 # The grids below were chosen by the study of 500 recordings (tests/study/test_hand_held_study.py); ``fit.refined``
 # refines their steps where the data determine the scatter better.
 UNLIKELY = -4.0  # prior log weight of a setting, e^-4 of the likeliest
@@ -140,6 +142,8 @@ class Equations:
     common: Values | None = None
     direction: Values | None = None
     frame: Values | None = None  # (n, 3); F
+    between: Values | None = None  # (n, 3 f); change by the bias of each recording, one standard deviation
+    files: int = 1  # number of recordings with rests, whose means show that bias
     alike: Values | None = None  # (n, n); covariance of the scatter between rests of slow movement, for a_0 = 1
     stated: int = 0  # number of the last equations, which are pseudo-observations of limits
     _kernels: dict[float, Values] = field(default_factory=dict, compare=False, repr=False)
@@ -251,9 +255,11 @@ def stacked(
         return np.asarray(scipy.linalg.block_diag(*filled))
 
     same, common = recording[:, None] == recording, diagonal([block.common for block in blocks])
+    between = None
     if model.between:
-        added = model.between**2 * np.sum(bias @ same.astype(float) @ bias.transpose(0, 2, 1), axis=0)
-        common = added if common is None else common + added
+        own = np.unique(recording)[:, None] == recording
+        between = model.between * np.concatenate([H @ own.T for H in bias], axis=1)
+        common = between @ between.T if common is None else common + between @ between.T
     frame = None
     if any(block.frame is not None for block in blocks):
         frame = np.concatenate([np.zeros((len(b.residual), 3)) if b.frame is None else b.frame for b in blocks])
@@ -272,6 +278,8 @@ def stacked(
         common=common,
         direction=diagonal([block.direction for block in blocks]),
         frame=frame,
+        between=between,
+        files=len(np.unique(model.rests.recording)),
         alike=diagonal([block.alike for block in blocks]),
         stated=sizes[-1] if blocks[-1].stated else 0,
     )
@@ -371,3 +379,32 @@ def limit_block(known: Mapping[str, float], columns: Values, state: State, unit:
         unit * u,
         stated=True,
     )
+
+
+def with_limits(
+    limits: Mapping[str, float], solve_with: Callable[[Mapping[str, float]], tuple[Fitted, Values]]
+) -> Fitted:
+    """Fit with pseudo-observations of those parameters that the recordings determine worse than the sensor file.
+
+    A parameter keeps its pseudo-observation where its variance is more than half of that of its limit, or without one
+    more than all of it: it is then mostly the limit's. ``limits``: name to standard uncertainty. ``solve_with``: fits
+    with some of them, and returns the fit and the standard uncertainties of all; raises an error if they leave a
+    combination open.
+    """
+    u = np.array(list(limits.values()))
+
+    def held(kept: Mask) -> Mapping[str, float]:
+        return {name: limit for name, limit, k in zip(limits, u.tolist(), kept, strict=True) if k}
+
+    every, known = solve_with(held(np.ones(len(u), bool)))
+    kept = known > u * np.sqrt(0.5)
+    while not kept.all():
+        try:
+            found, known_now = solve_with(held(kept))
+        except (NotObservableError, CannotCalibrateError):
+            known_now = known
+        else:
+            if not np.any(~kept & (known_now > u)):
+                return found
+        kept[int(np.argmax(np.where(kept, 0.0, known_now / u)))] = True
+    return every

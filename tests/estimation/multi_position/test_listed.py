@@ -503,6 +503,17 @@ def test_the_wander_of_soaks_is_no_difference_between_them_too(tmp_path: Path) -
     assert np.mean(part["standard_uncertainty"]["bias"]) == pytest.approx(of_mean / np.sqrt(2.0), rel=0.2)
 
 
+def test_the_bias_of_few_files_has_their_degrees_of_freedom(tmp_path: Path) -> None:
+    """Four means of three axes that scatter alike show a variance with 3 (4 - 1) degrees of freedom."""
+    unit = Unit(tmp_path, np.random.default_rng(12))
+    for number in range(4):
+        unit.write(f"rest_{number}", "rest,,,,", *at_rest(20.0, np.array([0.0, 0.0, 1.0])), "g", between=0.1)
+    unit.sheet()
+    part = calibrated(tmp_path).calibration["gyroscope"]
+    assert part["effective_degrees_of_freedom"][:3] == pytest.approx([9.0] * 3, rel=0.05)
+    assert part["coverage_factor"]["bias"] == pytest.approx([scipy.stats.t.ppf(0.975, 9)] * 3, rel=0.01)
+
+
 def test_rests_of_one_file_share_the_wander_where_they_are_as_many_as_parameters(tmp_path: Path) -> None:
     """Against the covariance of the exact equations ``|M (y - b)| = 1`` with white noise and the wander."""
     unit, rng, seconds = Unit(tmp_path, np.random.default_rng(2)), np.random.default_rng(3), 10.0
