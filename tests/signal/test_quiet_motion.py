@@ -14,11 +14,32 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import StageInput
-from pipeline.physics.signal.quiet_motion import before_slow_motion, creep_of_readings, posterior_creep_rates
+from pipeline.physics.signal.quiet_motion import (
+    DIFFERENCE_BLOCK,
+    before_slow_motion,
+    creep_of_readings,
+    posterior_creep_rates,
+    step_and_noise,
+)
 from pipeline.physics.signal.rests import Rest, find_rests
 from tests.published import validate
 
 QUIET = {"accelerometer": 3e-4, "gyroscope": 0.01}  # white noise of a sample, g and deg/s
+
+
+def test_step_and_noise_leave_out_missing_rows_and_are_kept_with_another_source() -> None:
+    reading = np.round(np.random.default_rng(5).normal(0.0, 0.04, (400, 3)), 2)
+    missing = np.insert(reading, 100, np.nan, axis=0)
+    recording = Recording("r", "rests", None, np.arange(401) * 10**7, accelerometer=missing)
+    step, noise = step_and_noise(recording, "accelerometer")
+    assert step == pytest.approx(np.full(3, 0.01))
+    count = 399 // DIFFERENCE_BLOCK
+    blocks = np.split(np.diff(reading, axis=0)[: count * DIFFERENCE_BLOCK], count)
+    quartile = np.quantile([np.mean(block**2, axis=0) for block in blocks], 0.25, axis=0)
+    assert noise == pytest.approx(np.sqrt(quartile / 2.0))
+    renamed = recording.with_source({"file": "a.csv"})
+    assert (renamed.source, recording.source) == ({"file": "a.csv"}, {})
+    assert step_and_noise(renamed, "accelerometer")[1] is noise
 
 
 def test_the_rate_of_a_steady_tilt_is_told_across_gravity_alone() -> None:

@@ -83,7 +83,7 @@ def ingest(files: UnitFiles, settings: Settings) -> list[Recording]:
         except PipelineError as error:
             error.message, error.file = error.message.replace(root, ""), error.file and error.file.replace(root, "")
             raise
-        return [replace(r, source=_named(r.source, lambda file: file.removeprefix(root))) for r in ingested]
+        return [r.with_source(_named(r.source, lambda file: file.removeprefix(root))) for r in ingested]
 
 
 def ingest_reads(job: Job, unit: str, settings: Settings) -> str | None:
@@ -116,7 +116,7 @@ def _ingested(files: UnitFiles, settings: Settings) -> list[Recording]:
         path = Path(file)
         return path.relative_to(files.directory).as_posix() if path.is_relative_to(files.directory) else file
 
-    return [replace(r, source=_named(r.source, below)) for r in check_recordings(recordings, settings)]
+    return [r.with_source(_named(r.source, below)) for r in check_recordings(recordings, settings)]
 
 
 def _named(source: Mapping[str, Any], name: Callable[[str], str]) -> dict[str, Any]:

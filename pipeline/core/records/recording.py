@@ -146,6 +146,12 @@ class Recording:
         vars(changed)["_quantities_of_log"] = self._quantities_of_log
         return changed
 
+    def with_source(self, source: dict[str, Any]) -> Self:
+        """Return the recording with other names of its files, and the same quantities."""
+        changed = object.__new__(type(self))
+        vars(changed).update(vars(self), source=source)
+        return changed
+
     @property
     def table_seconds(self) -> float:
         """Seconds of the table's clock per second of the sensor's clock, after alignment; 1 for a common clock."""
