@@ -435,16 +435,12 @@ def between_recordings(rests: Rests, turns: TurnsByHand | None, noise: Noise | N
     names = np.unique(rests.recording)
     if len(names) > 1:
         own = [rests.recording == name for name in names]
-        means = np.array([np.average(rests.reading[k], axis=0, weights=rests.count[k]) for k in own]) / white
+        W = np.array([k * rests.count / rests.count[k].sum() for k in own])
+        means = W @ rests.reading / white
         within = np.mean([np.average(rests.share[k], weights=rests.count[k]) / np.count_nonzero(k) for k in own])
-        within += 0.0 if noise is None else np.mean([_wander_of_mean(rests.select(k), noise, white) for k in own])
+        if noise is not None:  # the hypotheses hold the wander of these means
+            together = np.sum(W @ block_covariance(rests.start, rests.length, noise.correlation_time) * W, axis=1)
+            within += np.mean(together) * np.mean((noise.wander / white) ** 2)
         return float(np.sqrt(max(np.mean(np.var(means, axis=0, ddof=1)) - within, 0.0)))
     elsewhere = turns is not None and np.any(turns.recording != names[0])
     return float(np.sqrt(np.mean((noise.wander / white) ** 2))) if elsewhere and noise is not None else 0.0
-
-
-def _wander_of_mean(rests: Rests, noise: Noise, white: Values) -> float:
-    """Return the variance of the mean of a recording's rests by the bias wander, over that of white noise."""
-    weight = rests.count / rests.count.sum()
-    together = weight @ block_covariance(rests.start, rests.length, noise.correlation_time) @ weight
-    return float(together * np.mean((noise.wander / white) ** 2))

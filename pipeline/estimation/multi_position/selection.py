@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import scipy
@@ -39,14 +39,7 @@ from pipeline.estimation.multi_position.fit import (
     log_determinants,
     project_out,
 )
-from pipeline.estimation.multi_position.model import (
-    Equations,
-    Model,
-    NoiseHypothesis,
-    State,
-    effect_readings,
-    selection_hypotheses,
-)
+from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, selection_hypotheses
 from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import Score, without
 from pipeline.estimation.rest_means import Rests
@@ -62,7 +55,7 @@ ONE_CYCLE = "the soak passes no temperature twice in one direction, so hysteresi
 FEWEST_PARTS = 8  # of a soak that heats and cools
 TURNING = 0.2  # of the largest rate of the temperature: where it turns round
 # delta BIC of one curve above that of another: "positive" evidence (Raftery, Sociological Methodology 25, 1995); of 80
-# sensors with a lag none, of 96 with hysteresis all are called hysteresis
+# sensors with a lag none, of 96 with hysteresis by the sign of dT/dt all are called hysteresis
 PREFERRED = 2.0
 COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to its optimum
 
@@ -337,7 +330,10 @@ class SelectionByHand:
 
 
 class CommonLag(Effect):
-    """The lag of a thermometer, by one time for all axes: ``z = tau dz_T/dT dT/dt`` with the effects z_T of a fit."""
+    """The lag of a thermometer, ``z = tau dz_T/dT dT/dt`` with the effects z_T of a fit.
+
+    It has one time for all axes. At a constant rate, a lag of each axis has the curve of hysteresis.
+    """
 
     name, owner, layout = "a lag common to all axes", Owner.SENSOR, Layout.SHARED
 
@@ -353,16 +349,15 @@ class CommonLag(Effect):
         """Return the derivative by tau: (n, 3, 1) array."""
         del values
         assert motion.temperature is not None and motion.temperature_rate is not None  # noqa: S101, PT018
-        sides = [replace(motion, temperature=motion.temperature + step) for step in (0.5, -0.5)]  # degC
-        warmer, colder = (effect_readings(sensor, self.terms, side, K) for side in sides)
-        return np.asarray(((warmer - colder) * motion.temperature_rate[:, None])[:, :, None])
+        change = np.zeros_like(motion.specific_force)
+        for term, sign in product(self.terms, (1.0, -1.0)):
+            side = replace(motion, temperature=motion.temperature + 0.5 * sign)  # degC
+            change += sign * term.effect.reading(sensor, side, K, term.values)
+        return np.asarray((change * motion.temperature_rate[:, None])[:, :, None])
 
 
 def loops_of(model: Model, terms: Sequence[EffectColumns]) -> list[EffectColumns]:
-    """Return the curves of soaks that heat and cool: hysteresis, with the sign of dT/dt, and lag; empty without any.
-
-    ``terms``: effects of a fit.
-    """
+    """Return the curves of soaks that heat and cool, given effects: hysteresis, with the sign of dT/dt, and lag."""
     rate = (getattr(model, "soaks", None) or model.rests.select(model.rests.soaked)).temperature_rate
     cold = np.isnan(model.rests.temperature_rate).any()  # some recording holds no temperature
     if cold or not model.rests.swings or len(rate) < FEWEST_PARTS:
@@ -374,10 +369,7 @@ def loops_of(model: Model, terms: Sequence[EffectColumns]) -> list[EffectColumns
 
 
 def is_hysteresis(judged: Sequence[tuple[float, float]]) -> bool:
-    """Return whether soaks show hysteresis rather than lag, by delta BIC and p of ``loops_of``.
-
-    Where the temperature rises and falls at one rate, a separate lag of each axis has the curve of hysteresis.
-    """
+    """Return whether soaks show hysteresis rather than lag, by delta BIC and p of ``loops_of``."""
     by_loop, by_lag = (delta for delta, _ in judged)
     return by_loop > by_lag + PREFERRED
 
