@@ -195,7 +195,9 @@ def column_changed(made: Recorded) -> None:
 
 
 def of_another(made: Recorded) -> None:
-    """A file of another unit."""
+    """A file of another unit, beside others."""
+    if len(made.files) < 2:
+        raise NotApplicableError("no recording shows of which unit it is")
     name = made.draw(*made.files)
     with tempfile.TemporaryDirectory() as folder:
         KINDS[made.kind](Unit(Path(folder), made.rng))
