@@ -19,7 +19,9 @@ from pipeline.core.files import JSON
 from pipeline.core.records import AXES, SENSOR_UNITS, SENSORS, Noise, Recording, SensorCalibration, Values
 from pipeline.core.settings import DataSheet, Table
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S
+from pipeline.estimation.multi_position.model import motion_at_rests
 from pipeline.estimation.noise_terms import TERM_UNITS, allan_variance
+from pipeline.estimation.rest_means import SOAK, gathered, split_rests
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.evaluation.held_out.error_breakdown import with_known_effects
 from pipeline.evaluation.held_out.samples import OTHER_SENSOR, samples_of_motion
@@ -37,6 +39,7 @@ from pipeline.output.pages.chart import (
 )
 from pipeline.output.pages.group_charts import Point, bars
 from pipeline.output.pages.pages import Scale, number, percent
+from pipeline.physics.measurement import predicted_reading
 
 # held-out errors of diagnosis and validation that agree within this factor are shown as one series
 EQUAL_ERROR_FACTOR = 1.2
@@ -55,6 +58,48 @@ MAX_TIMES_DATA_SHEET = 5.0
 EQUAL_NOISE_FACTOR = 1.3
 SURE_TERM_PROBABILITY = 0.9  # probability of a set of terms above which no other set is named
 SYMBOLS = dict(zip(TERM_UNITS, "QNBKGRA", strict=True))
+
+
+def over_temperature(calibration: SensorCalibration, recordings: list[Recording]) -> Figure | None:
+    """Draw the change of a sensor's reading in soaks over the temperature, the model, and their difference.
+
+    Dots are means of parts of a soak, where the temperature rises and where it falls; each soak counts from its mean,
+    which its attitude determines. None without a soak that logs the temperature.
+    """
+    sensor, found = calibration.sensor, []
+    for recording in recordings:
+        parts = split_rests(recording, 0).used if recording.kind == SOAK and recording.temperature is not None else ()
+        if parts and recording.reading(sensor) is not None:
+            rests = gathered(sensor, recordings, {recordings.index(recording): parts})
+            force = np.tile(rests.reading.mean(axis=0) * (sensor == SENSORS[0]), (len(rests.time), 1))
+            model = predicted_reading(calibration, motion_at_rests(rests, force))
+            change, predicted = (values - values.mean(axis=0) for values in (rests.reading, model))
+            found += [
+                np.column_stack([rests.temperature, rests.temperature_rate, change, predicted]),
+                np.full((1, 8), np.nan),
+            ]
+    if not found:
+        return None
+    warmth, warming, *columns = np.concatenate(found).T  # lines end at the rows of NaN
+    unit, panels = SENSOR_UNITS[sensor], list[Panel]()
+    reading, model = np.array(columns[:3]), np.array(columns[3:])
+    for values, height in ((reading, 72), (reading - model, 56)):
+        for i, axis in enumerate(AXES):
+            layers: list[ChartLayer] = [LineMark(warmth, model[i], 5, "model")] if values is reading else []
+            layers += [Dots(warmth[way], values[i][way], c) for way, c in ((warming >= 0, 0), (warming < 0, 2))]
+            panels.append(Panel(layers, f"{axis}, {unit}", height, {} if values is reading else {"": 0.0}))
+    rms = [number(float(np.sqrt(np.nanmean(values**2))), 2) for values in (reading, reading - model)]
+    return chart(
+        Figure(
+            f"{sensor}-temperature",
+            f"Over the temperature the reading changes by {rms[0]} {unit}, beyond the model by {rms[1]} {unit} (rms)",
+            "Soaks: change of the mean reading, and below it reading minus model.",
+            (("c0", "warming"), ("c2", "cooling"), ("c5", "model")),
+        ),
+        f"Between {number(np.nanmin(warmth), 3)} and {number(np.nanmax(warmth), 3)} °C.",
+        panels,
+        "temperature, °C",
+    )
 
 
 def checks(validation: JSON | None) -> list[JSON]:

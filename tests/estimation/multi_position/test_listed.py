@@ -15,6 +15,7 @@ import pipeline
 from pipeline.app.field_logs.stream import compensate_log
 from pipeline.core.errors import InputError, NotObservableError
 from pipeline.core.records import SensorCalibration
+from pipeline.output.pages.held_out_section import over_temperature
 from pipeline.physics.compensation import load
 from pipeline.physics.statements import not_determined
 from tests.study.listed_recordings import (
@@ -388,6 +389,12 @@ def test_a_soak_shows_bias_over_temperature_to_the_third_power(tmp_path: Path) -
     assert steps[-1]["rms_error"] < 0.01
     assert steps[0]["rms_error"] > 1.0
     assert result.calibration["calibrated_range"]["temperature_degc"] == pytest.approx([-15.0, 65.0], abs=0.5)
+    figure = over_temperature(result._state.fits["gyroscope"], result._state.recordings.filtered)
+    changes, beyond = map(float, re.findall(r"by ([\d.]+) deg/s", figure.finding))
+    bias = np.outer(warm, [0.01, -0.02, 0.03]) + np.outer(warm**3, [2e-6, -3e-6, 1e-6])
+    assert changes == pytest.approx(np.sqrt(np.mean((bias - bias.mean(axis=0)) ** 2)), rel=0.03)
+    assert beyond < 0.01 * changes
+    assert {"warming", "cooling"} <= {text for _, text in figure.legend}
 
 
 # A thermometer that follows the die with a time constant, s; a bias that differs between heating and cooling, deg/s.
