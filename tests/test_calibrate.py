@@ -160,8 +160,7 @@ def test_motion_rests_temperatures_and_designs_are_computed_once(method: str | N
     for (path, _), count in calls.items():
         name = path.rpartition(".")[2]
         most[name] = max(most.get(name, 0), count)
-    # a table's rests as read and in body axes; the rows of each sensor
-    assert most.pop("rests_from_table") == most.pop("_part") == 2
+    assert most.pop("_part") == 2  # the rows of each sensor
     assert set(most.values()) == set(built.values()) == {1}
     assert {sensor for sensor, *_ in built} == {"accelerometer", "gyroscope"}
 

@@ -47,8 +47,6 @@ OF_SAMPLES = (
 )  # fmt: skip
 MEDIAN_SIZE = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise with standard deviation 1: 0.67449 sqrt(2)
-
-
 SPLINE_PART, SPLINE_MARGIN = 50_000, 100  # samples
 # Of a motion: they follow from the log. Those with three axes would have most of a long recording's memory.
 DEFERRED = (
