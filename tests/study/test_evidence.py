@@ -43,6 +43,16 @@ def test_the_page_is_written_from_the_stored_figures(evidence: ModuleType) -> No
     assert sum(bool(re.search(r"\w", word)) for word in PAGE.read_text().split()) <= 1500
 
 
+def test_holm_rejects_rows_one_by_one(evidence: ModuleType) -> None:
+    # 3.1, 2.6 and 1 standard errors: p of 0.0019, 0.0093 and 0.32. Of three rows the levels are 1/3, 1/2 and 1 %.
+    rows = [(0.95 + z * 0.004, z) for z in (1.0, 3.1, 2.6)]
+    half = 2.5758 * 0.004
+    figures = [MeasuredFigure(f"{z}", s, 900, "contains 95 %", (s - half, s + half)) for s, z in rows]
+    assert [figure.missed for figure in figures] == [False, True, True]
+    assert [figure.missed for figure in evidence.by_holm(figures)] == [False, True, False]
+    assert [figure.missed for figure in evidence.by_holm(figures[1:])] == [True, True]
+
+
 def test_the_readme_states_no_other_figures() -> None:
     page = " ".join(PAGE.read_text().replace("**", "").split())
     text = " ".join((ROOT / "README.md").read_text().split())
