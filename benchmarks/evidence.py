@@ -30,6 +30,7 @@ import scipy
 import yaml
 
 from imu_research.figures import MeasuredFigure, wilson
+from pipeline.output.pages.comparison import adjusted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -157,7 +158,7 @@ def page() -> str:
 def by_holm(figures: Sequence[MeasuredFigure]) -> list[MeasuredFigure]:
     """Return the figures, those with a goal of an interval only where Holm's test over all of these rejects it.
 
-    p of a row follows from its 99 % interval; level 1 % over all rows (Holm, Scand. J. Statistics 6, 1979).
+    p of a row follows from its 99 % interval; the level is 1 % over all rows.
     """
     p = {}
     for figure in figures:
@@ -167,11 +168,7 @@ def by_holm(figures: Sequence[MeasuredFigure]) -> list[MeasuredFigure]:
                 np.ptp(figure.interval) / 2.0 / scipy.stats.norm.isf(0.005),
             )
             p[figure.name] = 2.0 * scipy.stats.norm.sf(abs(figure.value - goal) / error)
-    kept = set(p)
-    for left, name in zip(range(len(p), 0, -1), sorted(p, key=p.__getitem__), strict=True):
-        if p[name] > 0.01 / left:
-            break
-        kept.remove(name)
+    kept = {name for name, value in zip(p, adjusted([*p.values()]), strict=True) if value > 0.01}
     return [figure._replace(goal="") if figure.name in kept else figure for figure in figures]
 
 

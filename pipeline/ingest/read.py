@@ -309,17 +309,22 @@ def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, che
     if not starts.all():
         return table
     if all(channel in table.values for channel in TRIADS["accelerometer"]):
-        u = np.column_stack([table.values[channel] for channel in TRIADS["accelerometer"]])
-        step = np.linalg.norm(np.diff(u / np.linalg.norm(u, axis=1, keepdims=True), axis=0), axis=1)
-        if len(step) and np.median(step) < LEAST_TURN_OF_ROWS:
+        turned = turn_between_rows(np.column_stack([table.values[channel] for channel in TRIADS["accelerometer"]]))
+        if turned < LEAST_TURN_OF_ROWS:
             message = (
                 f"kind attitudes takes each row as another attitude, but gravity turns by "
-                f"{np.degrees(np.median(step)):.2g} deg (median) from row to row: state in recordings.csv that it is "
+                f"{np.degrees(turned):.2g} deg (median) from row to row: state in recordings.csv that it is "
                 f"rest, moves or slow, or add a column {LABEL} with one text for all samples of an attitude"
             )
             raise IngestError(message, str(path), code="sheet")
     noise = {name: sensor.of(name).noise_density * float(np.sqrt(0.5 / AVERAGED_S)) for name in SENSORS}
     return replace(table, source={**table.source, NOISE_OF_ROWS: noise})
+
+
+def turn_between_rows(force: Values) -> float:
+    """Return the median angle, rad, between successive directions of (n, 3) readings; NaN for one row."""
+    u = force / np.linalg.norm(force, axis=1, keepdims=True)
+    return float(np.median(np.linalg.norm(np.diff(u, axis=0), axis=1))) if len(u) > 1 else float("nan")
 
 
 def _starts(path: Path, layout: CsvFormat, lines: Integers) -> Mask:

@@ -48,7 +48,7 @@ from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
 from pipeline.ingest.axis_maps import FAILS_DEG, FITS_DEG, MoveByHand, misfit_deg, moves_of, rests_of
 from pipeline.ingest.files import FILE, grouped, parts_of
 from pipeline.ingest.quality_flags import CLIPPED, GAP, REST_LIMITS, STUCK, equal_share
-from pipeline.ingest.read import read_attitudes, read_table, to_recording
+from pipeline.ingest.read import read_attitudes, read_table, to_recording, turn_between_rows
 from pipeline.physics.signal.rests import SHORTEST_REST_S, Rest, find_rests, rests_from_table, runs
 from pipeline.physics.signal.segments import MAX_AXIS_SINE, turns_by_hand
 from pipeline.simulation.description import shipped_settings
@@ -497,10 +497,8 @@ def _row(recording: Recording, bias: Values) -> str:
     if _is_still(recording):
         return f"{recording.name},{'soak' if _is_swept(recording) else 'rest'}"
     force, rate = recording.accelerometer, recording.gyroscope
-    if rate is None and force is not None:
-        u = force / np.linalg.norm(force, axis=1, keepdims=True)
-        if np.degrees(np.median(np.linalg.norm(np.diff(u, axis=0), axis=1))) > SAME_ATTITUDE_DEG:
-            return f"{recording.name},attitudes"
+    if rate is None and force is not None and np.degrees(turn_between_rows(force)) > SAME_ATTITUDE_DEG:
+        return f"{recording.name},attitudes"
     rests = [] if force is None else _accepted(recording)
     if rate is not None:
         own = np.mean([rate[r.start : r.stop].mean(axis=0) for r in rests], axis=0) if rests else bias

@@ -70,8 +70,8 @@ def over_temperature(calibration: SensorCalibration, recordings: list[Recording]
     for recording in recordings:
         parts = split_rests(recording, 0).used if recording.kind == SOAK and recording.temperature is not None else ()
         if parts and recording.reading(sensor) is not None:
-            rests = gathered(sensor, recordings, {recordings.index(recording): parts})
-            force = np.tile(rests.reading.mean(axis=0) * (sensor == SENSORS[0]), (len(rests.time), 1))
+            rests = gathered(sensor, [recording], {0: parts})
+            force = np.tile(rests.reading.mean(axis=0) * (sensor == "accelerometer"), (len(rests.time), 1))
             model = predicted_reading(calibration, motion_at_rests(rests, force))
             change, predicted = (values - values.mean(axis=0) for values in (rests.reading, model))
             found += [
