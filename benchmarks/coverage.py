@@ -10,7 +10,7 @@ stage ``effects``; then the truth of each parameter lies within its expanded unc
     table   with wander and with a table whose errors have the sizes that its configuration states
 
 The truth of the staged method, which is an approximation by design, is its own output without noise and table errors.
-Prints the share over all parameters with its standard error over units, that of the worst and best parameter, and CPU
+Prints the share over all parameters with its standard error over units, that of the worst and best parameter, and
 seconds. A study of some hours is cut into several of ``--n`` units each, from unit ``--first`` on.
 """
 
@@ -19,7 +19,10 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +39,8 @@ from pipeline.simulation.description import UnitDescription, shipped_settings
 from pipeline.unit import run_checked
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from pipeline.core.records import Recording, SensorCalibration
     from pipeline.core.settings import Settings
 
@@ -152,17 +157,22 @@ def judged(method: str, recordings: list[Recording], settings: Settings, hidden:
     return np.where(U > 0.0, error / np.where(U > 0.0, U, 1.0), np.nan)
 
 
-def study(methods: list[str], condition: str, units: range, seed: int, table: str) -> dict[str, np.ndarray]:
-    found: dict[str, list[np.ndarray]] = {name: [] for name in methods}
-    for number in units:
-        for procedure in (BENCH, HAND):
-            wanted = [name for name in methods if METHODS[name][0] == procedure]
-            if wanted and not (procedure == HAND and condition == "table"):
-                recordings, hidden = simulated(condition, table, procedure, seed, number)
-                settings = settings_of(condition, table, procedure)
-                for name in wanted:
-                    found[name].append(judged(name, recordings, settings, hidden))
-    return {name: np.array(rows) for name, rows in found.items() if rows}
+def study(methods: list[str], condition: str, number: int, seed: int, table: str) -> dict[str, np.ndarray]:
+    """Return error over expanded uncertainty of each parameter of a unit, by method."""
+    found = {}
+    for procedure in (BENCH, HAND):
+        wanted = [name for name in methods if METHODS[name][0] == procedure]
+        if wanted and not (procedure == HAND and condition == "table"):
+            recordings, hidden = simulated(condition, table, procedure, seed, number)
+            settings = settings_of(condition, table, procedure)
+            found |= {name: judged(name, recordings, settings, hidden) for name in wanted}
+    return found
+
+
+def joined(units: Iterable[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return the rows of all units, by method."""
+    found = list(units)
+    return {name: np.array([each[name] for each in found]) for name in found[0]}
 
 
 def main() -> None:
@@ -170,6 +180,7 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--conditions", default=",".join(CONDITIONS))
     parser.add_argument("--methods", default="", help="words that a method's name holds, with commas; all by default")
     parser.add_argument("--table", default="acutronic", help="table whose stated errors the condition table has")
@@ -179,10 +190,12 @@ def main() -> None:
     words = arguments.methods.split(",")
     methods = [name for name in METHODS if any(word in name for word in words)]
     for condition in arguments.conditions.split(","):
-        start = time.process_time()
+        start = time.monotonic()
         units = range(arguments.first, arguments.first + arguments.n)
-        found = study(methods, condition, units, arguments.seed, arguments.table)
-        print(f"{condition}, n = {arguments.n}, seed {arguments.seed}, {time.process_time() - start:.0f} s CPU")
+        of_unit = partial(study, methods, condition, seed=arguments.seed, table=arguments.table)
+        with ProcessPoolExecutor(arguments.processes, get_context("spawn")) as pool:
+            found = joined(pool.map(of_unit, units, chunksize=4))
+        print(f"{condition}, n = {arguments.n}, seed {arguments.seed}, {time.monotonic() - start:.0f} s")
         for name, ratios in found.items():
             known = ~np.all(np.isnan(ratios), axis=0)
             inside = np.abs(ratios[:, known]) <= 1.0

@@ -1,29 +1,38 @@
-"""Compares the stated probability of answer sets with the share that is true, for sizes that a study seldom hides.
+"""Compares stated probabilities with the share that is true, for sizes that a study seldom hides.
 
-    python benchmarks/probabilities.py prior|near --n 220 [--first 0] [--seed 991] [--figures FILE]
+    python benchmarks/probabilities.py prior|near --n 700 [--first 0] [--seed 991] [--processes 2] [--figures FILE]
 
 prior: each effect is hidden with its prior probability, at a scale and size drawn from the prior of the posterior
     (``pipeline.estimation.evidence``). There the share should be the stated probability.
-near: one effect at 0.5 to 1.5 times the size at which a selection just passes its gate. The prior draws few such sizes,
-    so that the share may be smaller.
+near: one effect at 0.5 to 1.5 times the size at which a selection just passes its gate (uniform). The prior draws few
+    such sizes, so that the share may be smaller.
 
-The truth of a unit is the set of its hidden effects without those that are stated as not observable.
+The truth of a unit is the set of its hidden effects without those that are stated as not observable. Bins are those of
+the study (``imu_research.study.scores.reliability``): of effects, of single answers and of answer sets.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # a process is one core
 
 import numpy as np
 
 from imu_research.figures import clustered_share, write_figures
 from imu_research.study.bench import at_detection
 from imu_research.study.cases import StudyCase, draw
+from imu_research.study.result import ScoredCase
 from imu_research.study.run import diagnose_case, scored
+from imu_research.study.scores import PROBABILITIES, reliability, stated_and_true
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS
 from pipeline.estimation.candidates import limits_of
@@ -74,32 +83,45 @@ def near_gate(number: int, seed: int) -> StudyCase:
 DRAWN: dict[str, Callable[[int, int], StudyCase]] = {"prior": of_prior, "near": near_gate}
 
 
+def diagnosed(sizes: str, seed: int, number: int) -> ScoredCase | None:
+    """Return the truth and the diagnosis of a unit; None where a step refuses it: an effect far beyond its limit."""
+    case = DRAWN[sizes](number, seed)
+    try:
+        _, state = diagnose_case(case)
+    except PipelineError:
+        return None
+    found = scored(state, case.sensor)
+    hidden = {name: values for name, values in case.hidden.items() if name not in found["not_observable"]}
+    # "single" is a family whose answer sets are scored.
+    return ScoredCase.from_json({**case.to_json(), **found, "key": case.key, "family": "single", "hidden": hidden})
+
+
 def main() -> None:
     """Run it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sizes", choices=DRAWN)
-    parser.add_argument("--n", type=int, default=220)
+    parser.add_argument("--n", type=int, default=700)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=991)
+    parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--figures", type=Path)
     options = parser.parse_args()
-    stated, true = [], []
-    for number in range(options.first, options.first + options.n):
-        case = DRAWN[options.sizes](number, options.seed)
-        try:
-            _, state = diagnose_case(case)
-        except PipelineError as refusal:  # of effects far beyond their limits
-            sys.stderr.write(f"{number}: refused: {refusal.message}\n")
-            continue
-        found = scored(state, case.sensor)
-        truth = sorted(set(case.hidden) - set(found["not_observable"]))
-        answers = [sorted(answer["effects"]) for answer in found["answer_set"]]
-        stated.append(min(1.0, sum(answer["probability"] for answer in found["answer_set"])))
-        true.append(np.array([truth in answers]))
-        sys.stdout.write(f"{number} {case.sensor} {sorted(case.hidden)}: {stated[-1]:.3f} {truth in answers}\n")
-    mean = 100.0 * float(np.mean(stated))
+    numbers = range(options.first, options.first + options.n)
+    with ProcessPoolExecutor(options.processes, get_context("spawn")) as pool:
+        found = list(pool.map(partial(diagnosed, options.sizes, options.seed), numbers, chunksize=4))
+    cases = [case for case in found if case is not None]
+    sys.stdout.write(f"{len(found) - len(cases)} of {len(found)} units refused\n")
+    sets = [true for each in stated_and_true(cases, "answer sets") for true in each]
+    mean = 100.0 * float(np.mean([probability for probability, _ in sets]))
+    # Clustered by unit: a unit has one set.
+    of_sets = clustered_share(f"all answer sets, stated {mean:.4g} %", [np.array([true]) for _, true in sets])
+    bins = [
+        row._replace(name=f"{of}, stated {row.name}", goal=row.goal if options.sizes == "prior" else "")
+        for of in PROBABILITIES
+        for row in reliability(cases, of)
+    ]
     goal = f"contains {mean:.4g} %" if options.sizes == "prior" else ""
-    figures = clustered_share(f"answer sets, sizes {options.sizes}, stated {mean:.4g} %", true, goal)
+    figures = [*(row._replace(goal=goal) for row in of_sets), *bins]
     sys.stdout.write("\n".join(" | ".join(map(str, figure.cells)) for figure in figures) + "\n")
     if options.figures:
         write_figures(options.figures, figures)
