@@ -17,7 +17,7 @@ from pipeline.app.one_unit import unit_of_recordings
 from pipeline.evaluation.held_out.validation import HELD
 from pipeline.output.exports import ExportedUnit, formats
 from pipeline.physics.effects import catalogue
-from pipeline.physics.effects.base import Owner
+from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Owner
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 from tests.study.listed_recordings import Unit
@@ -110,6 +110,20 @@ def test_an_effect_of_gravity_that_a_file_cannot_hold_stays_in_its_bias_as_far_a
     (held,) = [r for r in part["reduced"] if r["part"] == "full"]
     (same_bias,) = [step for step in part["steps"] if step["name"] == "calibrated"]
     assert held["rms_error"] < 0.85 * same_bias["rms_error"]  # a fit without the effect: 0.397 to 0.463 deg/s
+
+
+def test_a_file_without_the_slope_of_a_gyroscopes_scale_holds_the_matrix_at_the_recordings_temperature() -> None:
+    slope = np.array([0.002, -0.001, 0.0015])  # 1/degC, some per cent of the rate at 25 degC above or below 25 degC
+    effects, warm = {"gyroscope.scale_factor_temperature": slope.tolist()}, {"ambient": 40.0}
+    description = UnitDescription("U", table="acutronic", effects=effects, temperature=warm)
+    recordings, truth = simulate_unit(description, 7, 0)
+    layers = ["table=acutronic", "sensor=mpu6050", "effects.gyroscope=[scale_factor_temperature]"]
+    part = unit_of_recordings(recordings, layers).run_to("validate").validation["gyroscope"]
+    (held,) = [r for r in part["reduced"] if (r["part"], r["effects"]) == ("full", [])]
+    at = np.mean(np.concatenate([r.temperature for r in recordings if r.role == "gyroscope"])) - REFERENCE_TEMPERATURE
+    assert at > 10.0
+    K = np.linalg.inv(truth["gyroscope"]["matrix"]) + at * np.diag(slope)
+    np.testing.assert_allclose(held["matrix"], np.linalg.inv(K), atol=1e-3)
 
 
 def test_add_names_the_files_whose_error_changes() -> None:

@@ -110,6 +110,7 @@ HELD: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 LEAST_SPREAD_G = 0.1  # rms in each direction; in one attitude, effects alone would determine a matrix
 FEWEST_ROWS = 6  # orientations, of which an axis has an offset and three factors
+WARM = {"temperature", "angular_rate"}  # signals of an effect that changes a gyroscope's matrix
 AT_REST_TOO = {"time", "temperature", "specific_force"}  # signals
 
 
@@ -407,6 +408,7 @@ def reduced(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) ->
         if sum(int(s.known.sum()) for s in fitted) < FEWEST_ROWS:
             return []
         truth = _calibrated(calibration, fitted)
+    warm = _at_mean_temperature(calibration, fitted, truth)
     found: dict[tuple[str, frozenset[str]], Reduced] = {}
     for part, names in HELD:
         kept = frozenset(names) & own
@@ -418,7 +420,7 @@ def reduced(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) ->
             moving = [e for e in calibration.effects if not effect_of(e).fields("gyroscope", e.values) <= AT_REST_TOO]
             partial = replace(calibration, effects=tuple(e for e in calibration.effects if e in effects or e in moving))
         left = truth if partial.effects == calibration.effects else _calibrated(partial, fitted)
-        bias, matrix = _fitted(calibration, part, left, truth)
+        bias, matrix = _fitted(calibration if kept >= warm[0] else warm[1], part, left, truth)
         partial = replace(partial, effects=effects)
         error = rms_error_of(replace(partial, bias=bias, matrix=matrix), samples)
         found[part, kept] = Reduced(part, sorted(kept), bias.tolist(), matrix.tolist(), error)
@@ -428,6 +430,20 @@ def reduced(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) ->
 def _calibrated(calibration: SensorCalibration, samples: Sequence[Samples]) -> Values:
     """Return calibrated readings at samples that represent the recordings: (n, 3) array."""
     return np.concatenate([with_known_effects(calibration, s)[0][s.representative] for s in samples])
+
+
+def _at_mean_temperature(
+    calibration: SensorCalibration, fitted: Sequence[Samples], truth: Values
+) -> tuple[set[str], SensorCalibration]:
+    """Return effects of rate and temperature of a gyroscope, and its calibration with the best matrix without them."""
+    found = {e.name for e in calibration.effects if effect_of(e).fields(calibration.sensor, e.values) == WARM}
+    if not found:
+        return found, calibration
+    others = tuple(e for e in calibration.effects if e.name not in found)
+    left = _calibrated(replace(calibration, effects=others), fitted)
+    known = np.isfinite(left + truth).all(axis=1)
+    factor = np.linalg.lstsq(left[known], truth[known], rcond=None)[0].T
+    return found, replace(calibration, matrix=factor @ calibration.matrix)
 
 
 def _fitted(calibration: SensorCalibration, part: str, left: Values, truth: Values) -> tuple[Values, Values]:
