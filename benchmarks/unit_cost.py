@@ -1,8 +1,10 @@
 """What one unit costs: ``python benchmarks/unit_cost.py --minutes 60 --rate 1000``.
 
 A unit of the demo and one by hand (faces and turns) are calibrated by ``pipeline.calibrate_unit`` in a warm process.
-Then three units on a table with long recordings are simulated, and each goes through every stage, page included, in a
-process of its own: with nothing hidden, with two hidden effects, and on a home-made table whose ripple leaves the
+The demo is run, and the CPU time of ``explain``, ``guide --help`` and ``add`` of one effect, with all of its processes,
+is divided by that of importing numpy, scipy, pydantic and pyarrow with the parts that calibrations use. Then three
+units on a table with long recordings are simulated, and each goes through every stage, page included, in a process of
+its own: with nothing hidden, with two hidden effects, and on a home-made table whose ripple leaves the
 sensors unexplained. Printed are CPU seconds, of a long unit for each stage, rows of the diagnosis, the largest memory
 and the verdicts. A long unit that needs more than ``--limit`` CPU seconds is ended.
 """
@@ -13,6 +15,7 @@ import argparse
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -31,6 +34,12 @@ CASES = {  # with the largest CPU time that is wanted, s
 }
 MOST_MB = 1200.0
 SHORT = {"demo": 0.25, "by hand": 1.0}  # CPU s that are wanted
+IMPORTS = "import numpy, scipy.optimize, scipy.stats, pyarrow.parquet; from pydantic import BaseModel"
+COMMANDS = {  # of the demo, with the largest ratio to importing libraries that is wanted
+    "explain": (["explain", "demo", "mpu6050-2-hidden"], 1.2),
+    "guide --help": (["guide", "--help"], 0.4),
+    "add": (["add", "demo", "mpu6050-2-hidden", "gyroscope.g_sensitivity"], 8.0),
+}
 TIMES = 3  # of which the least is taken
 
 
@@ -48,7 +57,7 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (options.limit, options.limit))
         _calibrate(options.calibrate)
         return
-    figures = _short()
+    figures = [*_short(), *_commands()]
     samples = ["--samples", str(int(60.0 * options.minutes * options.rate)), "--interval", str(1.0 / options.rate)]
     for name, (more, wanted) in CASES.items():
         with tempfile.TemporaryDirectory() as folder:
@@ -86,6 +95,32 @@ def _short() -> list[MeasuredFigure]:
                 spent.append(time.process_time() - before)
             print(f"{name}, warm: {min(spent[1:]):.3f} CPU s")
             figures.append(MeasuredFigure(f"{name}, warm: CPU", min(spent[1:]), TIMES, f"<= {SHORT[name]:g}", unit="s"))
+    return figures
+
+
+def _commands() -> list[MeasuredFigure]:
+    """Return the CPU time of commands on the demo over that of importing libraries."""
+    figures = []
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copytree(ROOT / "data" / "demo", Path(folder, "demo"))
+
+        def least(words: list[str], times: int = TIMES) -> float:
+            spent = []
+            for _ in range(times):
+                before = resource.getrusage(resource.RUSAGE_CHILDREN)
+                subprocess.run([sys.executable, *words], cwd=folder, check=True, capture_output=True)
+                after = resource.getrusage(resource.RUSAGE_CHILDREN)
+                spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+            return min(spent)
+
+        run = ["-m", "snakemake", "--cores", "2", "--snakefile", str(ROOT / "Snakefile"), "--config", "campaign=demo"]
+        least(run, 1)
+        imports = least(["-c", IMPORTS])
+        for name, (words, wanted) in COMMANDS.items():
+            ratio = least(["-m", "pipeline", *words], 1 if name == "add" else TIMES) / imports
+            title = f"{name}: CPU over importing libraries"
+            print(f"{title}: {ratio:.2f}", flush=True)
+            figures.append(MeasuredFigure(title, ratio, 1, f"<= {wanted:g}", unit="times"))
     return figures
 
 
