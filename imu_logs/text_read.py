@@ -60,6 +60,7 @@ NEAR_INTERVALS = 2.5  # intervals
 LARGEST_DISPLACEMENT = 5  # rows
 MOST_LISTED = 5  # parts of a log, in a refusal
 SHORTEST_PART = 10  # rows; a shorter part is rows with a wrong time
+MANY_ROWS = 100_000  # whose memory is worth the 0.2 ms of returning it
 RESET_INTERVALS = 5  # a time that goes back by more begins another session
 
 
@@ -68,7 +69,10 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
     tables = [_read_one(path, layout, checks or Checks()) for path, layout in zip(paths, formats, strict=True)]
     same = [t for t, layout in zip(tables, formats, strict=True) if not layout.own_clock]
     others = [t for t, layout in zip(tables, formats, strict=True) if layout.own_clock]
-    return replace(joined(same), apart=tuple(others))
+    log = replace(joined(same), apart=tuple(others))
+    if len(log.time_ns) > MANY_ROWS:
+        pa.default_memory_pool().release_unused()  # of an hour at 1 kHz it kept 90 MB
+    return log
 
 
 def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> Log:

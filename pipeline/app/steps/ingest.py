@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from imu_logs.files import unchanged
 from pipeline.checks.checks import check_recordings
+from pipeline.checks.evidence import gravity_turned, of_table, spin
 from pipeline.core.errors import IngestError, PipelineError, failure_of
 from pipeline.core.pack import FAILED_SUFFIX, Pack, as_bytes, new_pack
 from pipeline.ingest.files import candidate_files, recording_files, state_of_recordings
@@ -116,7 +117,8 @@ def _ingested(files: UnitFiles, settings: Settings) -> list[Recording]:
         path = Path(file)
         return path.relative_to(files.directory).as_posix() if path.is_relative_to(files.directory) else file
 
-    return [r.with_source(_named(r.source, below)) for r in check_recordings(recordings, settings)]
+    checked = check_recordings(recordings, settings)  # turns between samples are read by checks alone
+    return [r.with_source(_named(r.source, below), of_table, spin, gravity_turned) for r in checked]
 
 
 def _named(source: Mapping[str, Any], name: Callable[[str], str]) -> dict[str, Any]:

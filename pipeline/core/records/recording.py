@@ -55,10 +55,10 @@ DEFERRED = (
 )
 
 
-class Quantities(dict["Hashable", Any]):
+class Quantities(dict["tuple[Hashable, ...]", Any]):
     """What is computed once, by all that it depends on."""
 
-    def once(self, key: Hashable, compute: Callable[[], ReturnedQuantity]) -> ReturnedQuantity:
+    def once(self, key: tuple[Hashable, ...], compute: Callable[[], ReturnedQuantity]) -> ReturnedQuantity:
         """Return what was computed at the first call with a key."""
         if key not in self:
             self[key] = compute()
@@ -104,7 +104,7 @@ class Recording:
         seconds: Values = self.time_ns // SECOND_NS + (self.time_ns % SECOND_NS) / SECOND_NS
         return seconds
 
-    @cached_property
+    @property
     def time_steps(self) -> Values:
         """Time from each sample to the next: (n - 1,) array, s."""
         return np.diff(self.time)
@@ -144,10 +144,12 @@ class Recording:
         vars(changed)["_quantities_of_log"] = self._quantities_of_log
         return changed
 
-    def with_source(self, source: dict[str, Any]) -> Self:
-        """Return the recording with other names of its files, and the same quantities."""
+    def with_source(self, source: dict[str, Any], *unread: Callable[..., object]) -> Self:
+        """Return the recording with other names of its files; ``unread``: quantities that are no longer kept."""
         changed = object.__new__(type(self))
-        vars(changed).update(vars(self), source=source)
+        known = (self._quantities, self._quantities_of_log)
+        mine, of_log = (Quantities({k: v for k, v in of.items() if k[0] not in unread}) for of in known)
+        vars(changed).update(vars(self), source=source, _quantities=mine, _quantities_of_log=of_log)
         return changed
 
     @property

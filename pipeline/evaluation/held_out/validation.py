@@ -317,7 +317,7 @@ def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> 
     floor = float(np.sqrt(np.mean(np.concatenate(squares))))
     if not all(direction_known(calibration, s) for s in samples):
         return floor, None
-    vectors = np.concatenate([s.variance[s.known] @ np.sum(calibration.matrix**2, axis=0) for s in samples])
+    vectors = np.concatenate([(s.variance @ np.sum(calibration.matrix**2, axis=0))[s.known] for s in samples])
     return floor, float(np.sqrt(np.mean(vectors)))
 
 
