@@ -59,6 +59,9 @@ SLOW_SPECTRUM_SHARE = 0.3
 MIN_MODELLED_TIME_S = 25.0
 
 
+CACHED = 16384  # numbers of ``GaussMarkov.squares`` that stay in the processor's cache: 128 kB
+
+
 class Setting(NamedTuple):
     """One noise hypothesis: ratio of bias to white noise, correlation time in s, and prior log weight."""
 
@@ -295,13 +298,9 @@ class GaussMarkov:
 
         In ``z_k = own_k a_k - past_k a_(k-1) - carried_k z_(k-1)`` each factor is of one setting and block.
         """
-        root = np.sqrt(self._d.reshape(self._half.shape))
-        below = np.append(self._e, 0.0).reshape(root.shape)[:, :-1]  # subdiagonal of L; T = L D L^T
-        past = self._phi / (self._half[:, :-1] * root[:, 1:])
         # blocks first, then settings and columns: numpy is fast if the last axis is long and contiguous
-        axis = 2 if columns.shape[1] > len(root) else 1  # of the columns
-        factors = 1.0 / (self._half * root), past, below * root[:, :-1] / root[:, 1:]
-        own, past, carried = (np.expand_dims(np.ascontiguousarray(v.T), axis) for v in factors)
+        axis = 2 if columns.shape[1] > len(self._half) else 1  # of the columns
+        own, past, carried = (np.expand_dims(v, axis) for v in self._factors)
         ordered = np.expand_dims(columns[self._order], 3 - axis)
         z = own * ordered
         z[1:] -= past * ordered[:-1]
@@ -309,6 +308,32 @@ class GaussMarkov:
         for before, row, factor in zip(rows, rows[1:], carried, strict=False):
             np.subtract(row, np.multiply(factor, before, out=part), out=row)
         return z.transpose(3 - axis, axis, 0)
+
+    @cached_property
+    def _factors(self) -> tuple[Values, Values, Values]:
+        """The factors of ``whitened``: (m, g) of a block, and (m - 1, g) of the one before it and of its result."""
+        root = np.sqrt(self._d.reshape(self._half.shape))
+        below = np.append(self._e, 0.0).reshape(root.shape)[:, :-1]  # subdiagonal of L; T = L D L^T
+        past = self._phi / (self._half[:, :-1] * root[:, 1:])
+        own, carried = 1.0 / (self._half * root), below * root[:, :-1] / root[:, 1:]
+        return np.ascontiguousarray(own.T), np.ascontiguousarray(past.T), np.ascontiguousarray(carried.T)
+
+    def squares(self, columns: Values) -> Values:
+        """Return ``a^T C^-1 a`` of each of (m, p) columns: (g, p) array, without keeping what ``whitened`` returns."""
+        own, past, carried = (v[:, :, None] for v in self._factors)
+        found: Values = np.empty((len(self._half), columns.shape[1]))
+        size = max(1, CACHED // len(found))
+        for at in (slice(first, first + size) for first in range(0, columns.shape[1], size)):
+            ordered = np.ascontiguousarray(columns[self._order, at])
+            z = own[0] * ordered[0]
+            total, part = z * z, np.empty_like(z)
+            for k in range(1, len(ordered)):
+                np.multiply(carried[k - 1], z, out=z)
+                np.subtract(np.multiply(own[k], ordered[k], out=part), z, out=z)
+                np.subtract(z, np.multiply(past[k - 1], ordered[k - 1], out=part), out=z)
+                np.add(total, np.multiply(z, z, out=part), out=total)
+            found[:, at] = total
+        return found
 
     def solve(self, columns: Values) -> Values:
         """Return ``C^-1 A`` of (m, p) columns: (g, m, p) array."""

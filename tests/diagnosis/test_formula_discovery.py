@@ -16,12 +16,13 @@ from unit_settings import settings_of
 from pipeline.app.steps.diagnose import effect_file
 from pipeline.core.records import Dependence, FittedForm, RankedFormula, Recording, SensorCalibration
 from pipeline.estimation.design import EffectColumns
-from pipeline.estimation.gauss_markov import Setting
+from pipeline.estimation.gauss_markov import Products, Setting
 from pipeline.estimation.generalized_least_squares import fit_joint, fit_terms
 from pipeline.estimation.noise import estimate_noise
-from pipeline.estimation.observations import observe
+from pipeline.estimation.observations import observe, without_rows
 from pipeline.estimation.selection import Selection, select
 from pipeline.evaluation.diagnosis import turntable
+from pipeline.evaluation.diagnosis.form_scan import ProjectedCurves, Scan
 from pipeline.evaluation.diagnosis.formula_discovery import (
     Discovery,
     FormProducts,
@@ -33,8 +34,6 @@ from pipeline.evaluation.diagnosis.formula_discovery import (
 from pipeline.evaluation.diagnosis.functional_forms import (
     Factor,
     Form,
-    ProjectedCurves,
-    Scan,
     Span,
     columns_of,
     exponential,
@@ -277,6 +276,21 @@ def test_products_of_factors_and_modulators_gain_what_the_columns_of_the_forms_g
             assert [each.axes for each in found] == [each.axes for each in expected]
             for one, other in zip(found, expected, strict=True):
                 assert one.delta_bic == pytest.approx(other.delta_bic, rel=1e-6, abs=1e-6)
+
+
+def test_products_of_resamples_are_those_of_their_rows() -> None:
+    selection = selection_of("gyroscope", record(Session(2, SHORT)))
+    scan = Scan(selection)
+    columns = np.concatenate([scan.columns, scan.values(columns_of(["fx * time"], "gyroscope"))[:, 0]], axis=1)
+    lengths = [len(part.weight) for part in scan.observations.parts]
+    halves = [np.arange(n) * 2 // n for n in lengths]
+    edges = np.flatnonzero(np.concatenate([np.diff(half, prepend=-1) for half in halves]))
+    rest = without_rows(scan.observations, [half == 1 for half in halves])
+    [(found, products)] = scan.resampled(columns, edges, [rest])
+    expected = Products(rest.blocks, rest.weight, columns).products(scan.settings)[0]
+    size = np.sqrt(np.einsum("pp->p", expected[0]))
+    assert products / np.outer(size, size) == pytest.approx(expected / np.outer(size, size), rel=1e-8, abs=1e-10)
+    assert found.samples == 3.0 * rest.samples
 
 
 def test_the_values_of_steps_and_exponentials_are_those_of_their_formulas() -> None:

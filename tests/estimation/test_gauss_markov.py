@@ -56,10 +56,14 @@ def test_products_solutions_and_determinants_are_those_of_the_dense_covariance()
     blocks = shuffled_blocks()
     columns = np.random.default_rng(1).standard_normal((len(blocks.weight), 4))
     model = GaussMarkov(blocks, SETTINGS)
-    for found, solved, logarithm, setting in zip(
-        model.products(columns), model.solve(columns), model.log_determinant, SETTINGS, strict=True
+    for found, squares, solved, logarithm, setting in zip(
+        *(each(columns) for each in (model.products, model.squares, model.solve)),
+        model.log_determinant,
+        SETTINGS,
+        strict=True,
     ):
         C = dense(blocks, setting)
+        np.testing.assert_allclose(squares, np.diag(found), rtol=1e-9)
         np.testing.assert_allclose(found, columns.T @ np.linalg.solve(C, columns), rtol=1e-9)
         np.testing.assert_allclose(solved, np.linalg.solve(C, columns), rtol=1e-8)
         assert logarithm == pytest.approx(np.linalg.slogdet(C)[1], rel=1e-10)

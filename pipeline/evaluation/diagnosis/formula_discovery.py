@@ -21,9 +21,10 @@ lists, by complexity, the forms that gain more than all simpler ones.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property
 from itertools import chain, combinations, count, pairwise, starmap
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +37,8 @@ from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import without_each_recording, without_rows
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.evaluation.diagnosis import functional_forms as forms
-from pipeline.evaluation.diagnosis.functional_forms import Form, FormGain, ProjectedCurves, Scan, Span
+from pipeline.evaluation.diagnosis.form_scan import FormGain, ProjectedCurves, Scan
+from pipeline.evaluation.diagnosis.functional_forms import Form, Span
 from pipeline.evaluation.diagnosis.residual_dependence import dependences
 from pipeline.evaluation.diagnosis.words import listed
 from pipeline.physics.effects import catalogue, effect_from, forget, register
@@ -53,15 +55,12 @@ if TYPE_CHECKING:
     from pipeline.evaluation.diagnosis.findings import DiagnosisInput
     from pipeline.evaluation.diagnosis.functional_forms import Factor
 
-    KnownColumns = dict[tuple[tuple[tuple[str, ...], ...], int], tuple[int, Values]]
-
 PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
 # least delta BIC of a further term over that of the first: less may be rounding of the first's constants
 MIN_FURTHER_GAIN_SHARE = 0.02
 MAX_FORMULA_TERMS = 3
 REFINED = 16  # forms that are scored under every noise setting, and whose constants are scanned more finely
 SCAN_REFINEMENTS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
-CACHED = 512  # columns of block means that are whitened together: they stay in the processor's cache
 ROWS_AT_ONCE = 8192  # whose products of columns are computed together: 20 MB
 PROBED = 200  # rows; two forms whose values there are equal to 1e-9 are one
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
@@ -100,31 +99,41 @@ class FormProducts:
         self._squares: dict[tuple[Setting, ...], Values] = {}  # by noise: (t, q, p)
         self._across: dict[tuple[Design, tuple[Setting, ...]], Values] = {}  # by model and noise, see ``across``
         self.scanned = np.array([form.scanned for form in tried])
-        kinds: tuple[KnownColumns, KnownColumns] = {}, {}
+        kinds: tuple[list[Values], list[Values]] = [], [np.ones(len(scan.weight))]
 
-        def place(known: KnownColumns, parts: Sequence[tuple[Factor, tuple[str, ...]]], axis: int) -> int:
-            """Return the place of a product of sums of some columns of factors."""
-            key = tuple(texts for _, texts in parts), axis if any(factor.signal == "u" for factor, _ in parts) else 0
+        def places(kind: int, factor: Factor, times: Factor | None = None) -> list[list[int]]:
+            """Return the places on each axis of the columns of a product, and of the sums of two: (3, q) list."""
+            key = kind, factor.texts, times.texts if times else ()
             if key not in known:
-                sums = (sum(grammar.on_axis(text, factor, axis) for text in texts) for factor, texts in parts)
-                known[key] = len(known), reduce(np.multiply, sums, np.ones(len(scan.weight)))
-            return known[key][0]
+                of_axes: list[list[int]] = []
+                for axis in range(3 if "u" in (factor.signal, times and times.signal) else 1):
+                    own = [grammar.on_axis(text, factor, axis) for text in factor.texts]
+                    own += [one + other for one, other in combinations(own, 2)]
+                    own = [grammar.on_axis(times.texts[0], times, axis) * each for each in own] if times else own
+                    of_axes.append([*range(len(kinds[kind]), len(kinds[kind]) + len(own))])
+                    kinds[kind].extend(own)
+                known[key] = of_axes * (3 // len(of_axes))
+            return known[key]
 
-        def places(form: Form, axis: int) -> list[tuple[int, int]]:
-            """Return the places of a form's columns, and of the sums of two."""
-            texts, modulator = form.factor.texts, [(form.modulator, form.modulator.texts)] if form.modulator else []
-            own = [[(form.factor, each)] for each in (*((text,) for text in texts), *combinations(texts, 2))]
-            pairs = [(each, modulator) if apart else ([*each, *modulator], []) for each in own]
-            return [(place(kinds[0], f, axis), place(kinds[1], g, axis)) for f, g in pairs]
-
+        known: dict[tuple[int, tuple[str, ...], tuple[str, ...]], list[list[int]]] = {}
         alike: dict[tuple[int, int], list[int]] = {}  # forms whose columns have the same shape
+        pairs = []  # places of both kinds on each axis
         for k, form in enumerate(tried):
             alike.setdefault((len(form.factor.texts), 3 if "u" in form.signals else 1), []).append(k)
+            modulator = places(1, form.modulator) if apart and form.modulator else [[0]] * 3
+            pairs.append((places(0, form.factor, None if apart else form.modulator), modulator))
         self.alike = [
-            (r, members, np.array([[places(tried[k], axis) for k in members] for axis in range(axes)]))
+            (
+                r,
+                members,
+                [
+                    [np.array([each[axis] for each in kind]) for kind in zip(*(pairs[k] for k in members), strict=True)]
+                    for axis in range(axes)
+                ],
+            )
             for (r, axes), members in alike.items()
         ]
-        F, G = self.columns = [np.stack([column for _, column in known.values()], axis=1) for known in kinds]
+        F, G = self.columns = [np.stack(known, axis=1) for known in kinds]
         weighted, edges = scan.weight[:, None] * G, [*scan.blocks.first.tolist(), len(F)]
         sums = np.stack([F[at].T @ weighted[at] for at in starmap(slice, pairwise(edges))])
         self.means = sums.reshape(len(sums), -1) / scan.blocks.weight[:, None]
@@ -135,10 +144,7 @@ class FormProducts:
     def squares(self, scan: Scan) -> Values:
         """Return the whitened squares of the products: (t, q, p) array."""
         if scan.settings not in self._squares:
-            pieces = np.array_split(self.means, self.means.shape[1] // CACHED + 1, axis=1)
-            white = (scan.noise.whitened(piece) for piece in pieces)
-            own = np.concatenate([np.einsum("tqm,tqm->tq", piece, piece) for piece in white], axis=1)
-            self._squares[scan.settings] = own.reshape(-1, *self.inside.shape) + self.inside
+            self._squares[scan.settings] = scan.noise.squares(self.means).reshape(-1, *self.inside.shape) + self.inside
         return self._squares[scan.settings]
 
     def gains(self, scan: Scan) -> list[FormGain]:
@@ -147,13 +153,13 @@ class FormProducts:
         across, squares = self.across(scan), self.squares(scan)
         for r, members, places in self.alike:
             grams, with_all = [], []
-            for f, m in np.moveaxis(places, 3, 1):
+            for f, m in places:
                 own, gram = squares[:, f, m], np.empty((len(squares), len(members), r, r))
                 gram[..., range(r), range(r)] = own[..., :r]
                 for k, (i, j) in enumerate(combinations(range(r), 2), r):
                     gram[..., i, j] = gram[..., j, i] = 0.5 * (own[..., k] - own[..., i] - own[..., j])
                 grams.append(gram)
-                with_all.append(across[:, f[:, :r].ravel(), m[:, :r].ravel()])
+                with_all.append(across[:, f[:, :r], m].reshape(len(across), -1, across.shape[3]))
             gains = scan.best_axes(scan.drops_of(grams, with_all), r, self.scanned[members])
             found |= dict(zip(members, gains, strict=True))
         return [found[k] for k in range(len(found))]
@@ -223,26 +229,25 @@ class Forms:
             self._columns[text] = of_signal
         return self._columns[text]
 
-    def gains(self, tried: Sequence[Form], scan: Scan | None = None, *, coarse: bool = False) -> list[FormGain]:
-        """Return the gain of each form; ``coarse``: under the noise of the fit, the least wander and a middle one."""
-        scan = scan or self.scan
-        if coarse:
-            ordered = sorted(self.selection.settings, key=lambda setting: setting.ratio)
-            few = dict.fromkeys([self.selection.fit.setting, ordered[0], ordered[len(ordered) // 2]])
-            scan = Scan(replace(self.selection, settings=[*few]), self.explained)
-        if not coarse:
-            return FormProducts(self, tried, scan, apart=False).gains(scan) if tried else []
+    def gains(self, tried: Sequence[Form]) -> list[FormGain]:
+        """Return the gain of each form."""
+        return FormProducts(self, tried, self.scan, apart=False).gains(self.scan) if tried else []
+
+    def _coarse(self) -> list[Form]:
+        """Return the forms with the best scores under the noise of the fit, the least wander and a middle one."""
         if self._kept is None:  # bands have no modulators
-            bands = [form for form in tried if form.factor.kind == "band"]
-            products = FormProducts(self, tried[: len(tried) - len(bands)], scan, apart=True)
-            self._kept = [products, *([FormProducts(self, bands, scan, apart=False)] if bands else [])]
-        return [gain for table in self._kept for gain in table.gains(scan)]
+            bands = [form for form in self._tried if form.factor.kind == "band"]
+            products = FormProducts(self, self._tried[: len(self._tried) - len(bands)], self.scan, apart=True)
+            self._kept = [products, *([FormProducts(self, bands, self.scan, apart=False)] if bands else [])]
+        ordered = sorted(self.selection.settings, key=lambda setting: setting.ratio)
+        few = dict.fromkeys([self.selection.fit.setting, ordered[0], ordered[len(ordered) // 2]])
+        scan = self.scan.of_settings(few)
+        gains = [gain for table in self._kept for gain in table.gains(scan)]
+        return [each.form for each in _best_of_each(map(ScoredForm, self._tried, gains))[:REFINED]]
 
     def ranked(self) -> list[ScoredForm]:
         """Return the best form of each name, best score first."""
-        spans = self._spans
-        best = _best_of_each(map(ScoredForm, self._tried, self.gains(self._tried, coarse=True)))[:REFINED]
-        refined = [each.form for each in best]
+        spans, refined = self._spans, self._coarse()
         best = _best_of_each(map(ScoredForm, refined, self.gains(refined)))
         for spacing in SCAN_REFINEMENTS:
             near = [
@@ -510,18 +515,29 @@ def _front(grammar: Forms, terms: Sequence[ScoredForm], ranked: Sequence[ScoredF
 
 def _stability(grammar: Forms, finalists: Sequence[ScoredForm]) -> list[float]:
     """Return the share of the resamples with a clear score in which each form has the best score."""
-    observations = grammar.selection.observations
+    scan = Scan(grammar.selection)
+    observations, columns, alike = scan.observations, scan.columns, defaultdict(list)
+    for each in finalists:
+        values = scan.values(forms.columns_of(each.form.formulas, observations.sensor))
+        places = columns.shape[1] + np.arange(values[0].size).reshape(values.shape[1:])
+        columns = np.concatenate([columns, values.reshape(len(values), -1)], axis=1)
+        alike[places.shape].append((each.form, places))
     lengths = [len(part.weight) for part in observations.parts]
-    folds = ([np.arange(n) * RECORDING_FOLDS // n == fold for n in lengths] for fold in range(RECORDING_FOLDS))
-    resamples = chain(without_each_recording(observations), (without_rows(observations, rows) for rows in folds))
-    wins, counted = np.zeros(len(finalists)), 0
-    for resample in resamples:
-        gains = grammar.gains([each.form for each in finalists], Scan(grammar.selection, rows=resample))
-        scores = [ScoredForm(each.form, gain).score for each, gain in zip(finalists, gains, strict=True)]
-        if max(scores) > MIN_DELTA_BIC:
-            wins[int(np.argmax(scores))] += 1
-            counted += 1
-    return [float(share) for share in wins / max(counted, 1)]
+    cells = [np.arange(n) * RECORDING_FOLDS // n for n in lengths]
+    folds = (without_rows(observations, [cell == fold for cell in cells]) for fold in range(RECORDING_FOLDS))
+    edges = np.flatnonzero(np.concatenate([np.diff(cell, prepend=-1) for cell in cells]))
+    wins, model = dict.fromkeys((each.form for each in finalists), 0), slice(scan.columns.shape[1])
+    for resample, products in scan.resampled(columns, edges, chain(without_each_recording(observations), folds)):
+        scored: list[ScoredForm] = []
+        for (_, r), members in alike.items():
+            tried, of_axes = [form for form, _ in members], np.stack([places for _, places in members], axis=1)
+            grams = [products[:, at[:, :, None], at[:, None]] for at in of_axes]
+            drops = resample.drops_of(grams, [products[:, at.ravel(), model] for at in of_axes])
+            gains = resample.best_axes(drops, r, np.array([form.scanned for form in tried]))
+            scored += map(ScoredForm, tried, gains)
+        best = max(scored, key=lambda each: each.score)
+        wins[best.form] += best.score > MIN_DELTA_BIC
+    return [wins[each.form] / max(sum(wins.values()), 1) for each in finalists]
 
 
 def suggested_effect(covariate: str, form: FittedForm, sensor: str, taken: Collection[str]) -> dict[str, Any]:

@@ -49,17 +49,8 @@ from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Blocks, GaussMarkov, Products, Setting, selection_grid
 from pipeline.estimation.multi_position.fit import solve
 from pipeline.estimation.ranking import projection
-from pipeline.evaluation.diagnosis.functional_forms import (
-    Curves,
-    ProjectedCurves,
-    Scan,
-    Span,
-    Whitened,
-    available_signals,
-    columns_of,
-    each_explains,
-    signals_of,
-)
+from pipeline.evaluation.diagnosis.form_scan import ProjectedCurves, Scan, Whitened, each_explains
+from pipeline.evaluation.diagnosis.functional_forms import Curves, Span, available_signals, columns_of, signals_of
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import Layout, truth, unit_of
 from pipeline.physics.formula import parse
