@@ -175,18 +175,18 @@ class Scan:
         """Return the means of (n, q) columns in blocks: (m, q) array."""
         return np.asarray(self.blocks.sums(self.weight[:, None] * columns) / self.blocks.weight[:, None])
 
-    def without_model(self, c: int, one: Whitened, other: Whitened) -> Values:
-        """Return the products of columns on an axis without their part in the model, white noise first: (t, q, p)."""
-        known, _, inverse = self._fitted[c]
-        taken = one.times(self.every)[:, :, known] @ inverse @ self.every.times(other)[:, known]
-        return np.asarray((one.times(other) - taken) / self.scale[c] ** 2)
+    def without_model(self, c: int, one: Whitened, other: Whitened) -> tuple[Values, Values]:
+        """Return products of columns on an axis without their part in the model, white noise first.
 
-    def squares_without_model(self, c: int, one: Whitened) -> Values:
-        """Return the squares of columns on an axis without their part in the model, white noise first: (t, q)."""
-        known, _, inverse = self._fitted[c]
-        cross = one.times(self.every)[:, :, known]
-        own = np.einsum("tqm,tqm->tq", one.means, one.means) + np.einsum("nq,nq->q", one.inside, one.inside)
-        return np.asarray((own - np.einsum("tqp,tqp->tq", cross @ inverse, cross)) / self.scale[c] ** 2)
+        Those of one with other columns are a (t, q, p) array, the squares of the other ones a (t, p) array.
+        """
+        index, _, inverse = self._fitted[c]
+        known = Whitened(self.every.inside[:, index], self.every.means[:, index])
+        across = known.times(other)
+        taken = inverse @ across
+        own = np.einsum("tqm,tqm->tq", other.means, other.means) + np.einsum("nq,nq->q", other.inside, other.inside)
+        squares = own - np.einsum("tkp,tkp->tp", across, taken)
+        return (one.times(other) - one.times(known) @ taken) / self.scale[c] ** 2, squares / self.scale[c] ** 2
 
     def log_likelihood(self, rss: Values, within: Values | None = None) -> Values:
         """Return the log likelihood under each noise setting, (t, ...), of whitened sums of squares.

@@ -36,6 +36,7 @@ Source: R. D. Cook and S. Weisberg, Residuals and Influence in Regression, 1982,
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -191,11 +192,10 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     fitted = ProjectedCurves(scan, scan.values(_curves_of(bases)))
     within = np.append(scan.within, np.full(SIMULATIONS, 3.0 * (observations.samples - len(observations.weight))))
     left, cross = np.zeros((len(scan.left), 1 + SIMULATIONS)), []  # of the readings and each simulation
-    for c, draws in enumerate(_draws(selection, scan)):
-        left[:, 0] += scan.left[:, c]
-        left[:, 1:] += scan.squares_without_model(c, draws)[1:]
-        of_draws = scan.without_model(c, fitted.columns[0], draws)[1:]
-        cross.append(np.concatenate([fitted.cross[:, c, :, None], of_draws], axis=2))
+    for c, (drawn, curves, draws) in enumerate(_draws(selection, scan, fitted.columns[0])):
+        of_draws, squares = drawn.without_model(c, curves, draws)
+        left += np.concatenate([scan.left[:, c, None], squares[1:]], axis=1)
+        cross.append(np.concatenate([fitted.cross[:, c, :, None], of_draws[1:]], axis=2))
 
     def likelihood(rss: Values) -> Values:
         return np.asarray(scan.log_likelihood(rss, within).max(axis=0))
@@ -212,15 +212,25 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     return {"share_worse": float(np.mean(smallest_p[1:] <= smallest_p[0])), "simulations": SIMULATIONS}
 
 
-def _draws(selection: Selection, scan: Scan) -> Iterator[Whitened]:
-    """Yield draws from the noise of the fit for each axis: s columns."""
-    rng, blocks, root = np.random.default_rng(0), scan.blocks, np.sqrt(scan.weight)[:, None]
-    label, noise = blocks.label(len(root)), GaussMarkov(blocks, [selection.fit.setting])
+def _draws(selection: Selection, scan: Scan, curves: Whitened) -> Iterator[tuple[Scan, Whitened, Whitened]]:
+    """Yield scan, curves and s draws from the noise of the fit for each axis, all with rotated rows.
+
+    Of white noise within the blocks the products with q columns A and the square are drawn, not every row: ``A = Q R``,
+    ``Q^T e`` is white noise, and the square of the rest is chi-squared.
+    """
+    rng, drawn, p = np.random.default_rng(0), copy(scan), scan.columns.shape[1]
+    columns = np.concatenate([scan.every.inside, curves.inside], axis=1)
+    size, free = np.maximum(np.linalg.norm(columns, axis=0), 1e-150), len(columns) - len(scan.blocks.first)
+    squares, directions = np.linalg.eigh(columns.T @ columns / np.outer(size, size))
+    rotated = (np.sqrt(np.maximum(squares, 0.0)) * directions).T[-free:] * size if free else columns[:0]
+    rest = 0.5 * (free - len(rotated))
+    rotated = np.concatenate([rotated, np.zeros((1, len(size)))])
+    drawn.every, noise = Whitened(rotated[:, :p], scan.every.means), GaussMarkov(scan.blocks, [selection.fit.setting])
     for scale in scan.scale:
-        white = rng.standard_normal((len(root), SIMULATIONS))
-        white -= root * (blocks.sums(root * white) / blocks.weight[:, None])[label]
-        white *= scale
-        yield Whitened(white, scan.noise.whitened(scale * noise.draw(rng, SIMULATIONS)))
+        white = rng.standard_normal((len(rotated), SIMULATIONS))
+        white[-1] = np.sqrt(2.0 * rng.standard_gamma(rest, SIMULATIONS))
+        means = scan.noise.whitened(scale * noise.draw(rng, SIMULATIONS))
+        yield drawn, Whitened(rotated[:, p:], curves.means), Whitened(scale * white, means)
 
 
 def _curves_of(bases: Sequence[Basis]) -> Curves:
