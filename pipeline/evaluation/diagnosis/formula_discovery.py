@@ -390,19 +390,24 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
     floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
     best, least = Discovery(selection, selection, unknown), _criterion(selection, []) + MIN_DELTA_BIC
     alone, grammar = replace(selection, steps={}, fit=selection.base), None
+    tried: list[tuple[Sequence[str], Sequence[str]]] = []
     for context in [selection, alone] if selection.names else [selection]:
         grammar = grammar.at(context) if grammar else Forms(context)
         terms, ranked = search(grammar)
         if not terms:
             continue
         found, first = _fitted_form(context, terms), terms[0]
+        if (found.formulas, found.axes) in tried:  # with the same form in the base, the same effects are selected
+            continue
         entry = Dependence(first.form.covariate, first.gain.p_value, sum(term.gain.delta_bic for term in terms), found)
         definition = suggested_effect(entry.covariate, found, case.sensor, catalogue())
         form = effect_from(definition, "a first guess")
         added = [*context.fit.terms, EffectColumns(form, np.zeros(len(form.parameters(case.sensor))))]
-        residual_rms = fit_terms(context.observations, added, context.start, context.settings).residual_rms
-        if 0.0 < FAR_ABOVE * floor < residual_rms:
-            continue
+        if 0.0 < FAR_ABOVE * floor < context.fit.residual_rms:
+            fit = fit_terms(context.observations, added, context.start, context.settings)
+            if fit.residual_rms > FAR_ABOVE * floor:
+                continue
+        tried.append((found.formulas, found.axes))
         names = [*case.configured, form.name]
         register(form)
         try:
@@ -411,10 +416,12 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
             forget(form.name)
         criterion = _criterion(reselected, terms)
         if criterion > least:
-            least, front = criterion, _front(grammar, terms, ranked)
-            best = Discovery(context, reselected, [entry, *unknown], definition, front)
-    fitted = best.unknown[0].form if best.unknown else None
-    return replace(best, unknown=_explained(best, fitted)) if fitted else best
+            least, best = criterion, Discovery(context, reselected, [entry, *unknown], definition)
+            suggested = found, terms, ranked
+    if best.suggested is None:
+        return best
+    found, terms, ranked = suggested
+    return replace(best, unknown=_explained(best, found), front=_front(best.context, terms, ranked))
 
 
 def _criterion(selection: Selection, terms: Sequence[ScoredForm]) -> float:
@@ -489,10 +496,10 @@ def _explained(found: Discovery, form: FittedForm) -> list[Dependence]:
     return [first, *(e if e.covariate in remaining else replace(e, explained_by=first.covariate) for e in others)]
 
 
-def _front(grammar: Forms, terms: Sequence[ScoredForm], ranked: Sequence[ScoredForm]) -> list[RankedFormula]:
+def _front(context: Selection, terms: Sequence[ScoredForm], ranked: Sequence[ScoredForm]) -> list[RankedFormula]:
     """Return the forms of one term that gain more than all simpler ones, and before them the suggested one."""
     finalists = list(ranked[:FINALISTS])
-    stable = _stability(grammar, finalists)
+    stable = _stability(context, finalists)
     shown: list[ScoredForm] = []
     for each in sorted(ranked, key=lambda each: (each.form.complexity + each.form.scanned, -each.gain.delta_bic)):
         if not shown or each.gain.delta_bic > shown[-1].gain.delta_bic:
@@ -513,9 +520,9 @@ def _front(grammar: Forms, terms: Sequence[ScoredForm], ranked: Sequence[ScoredF
     ]
 
 
-def _stability(grammar: Forms, finalists: Sequence[ScoredForm]) -> list[float]:
+def _stability(context: Selection, finalists: Sequence[ScoredForm]) -> list[float]:
     """Return the share of the resamples with a clear score in which each form has the best score."""
-    scan = Scan(grammar.selection)
+    scan = Scan(context)
     observations, columns, alike = scan.observations, scan.columns, defaultdict(list)
     for each in finalists:
         values = scan.values(forms.columns_of(each.form.formulas, observations.sensor))
