@@ -74,16 +74,16 @@ def read_recordings(
     """
     require_recordings(procedure, folder)
     checks, layouts = checks_of(ingest), csv_formats(ingest) if ingest.csv else None
-    found, missing = set[str](), list[str]()
+    found, missing, left_out = set[str](), list[str](), list[str]()
     recordings: list[Recording] = []
     refused: list[InputError] = []
     for name, candidates in candidate_files(procedure, ingest).items():
         entry = procedure.recordings[name]
         files, wanted, unread = _existing(candidates, folder) if name not in in_memory else ([name], [name], [])
         if not files:
-            missing += (
-                [] if entry.optional else [f"{name} (tried {tried(candidates)}){_of_other_suffix(name, entry, folder)}"]
-            )
+            other = _of_other_suffix(name, entry, folder)
+            missing += [] if entry.optional else [f"{name} (tried {tried(candidates)}){other}"]
+            left_out += [f"no {name}{other}"] if entry.optional and other else []
             continue
         found.add(name)
         if files != wanted:
@@ -116,6 +116,9 @@ def read_recordings(
             first.message += f". Also refused: {'; '.join(listed[:MAX_NAMED_FILES])}"
             first.message += f" and {len(others) - MAX_NAMED_FILES} more" if len(others) > MAX_NAMED_FILES else ""
         raise first
+    if left_out:
+        note = Note("N-NOTREAD", len(left_out), 0, 0, "; ".join(left_out))
+        recordings[0] = replace(recordings[0], notes=(*recordings[0].notes, note))
     _check_different(recordings)
     return _compare_clocks(recordings)
 

@@ -240,6 +240,19 @@ def test_second_kind_of_file_is_noted(tmp_path: Path, canonical: dict[str, Any])
     ]
 
 
+def test_a_file_of_an_optional_recording_with_another_suffix_is_noted(
+    tmp_path: Path, canonical: dict[str, Any]
+) -> None:
+    write_recording(tmp_path / "a.csv", make_recording())
+    (tmp_path / "b.txt").touch()
+    known = procedure("a", "b")
+    optional = known.recordings["b"].replaced(optional=True)
+    known = known.replaced(recordings={**known.recordings, "b": optional})
+    (recording,) = read_recordings(known, ingest_of(canonical), SENSOR, tmp_path)
+    told = "no b: b.txt lies there; rename it, or set procedure.recordings.b.file=b.txt"
+    assert [(n.code, n.detail) for n in recording.notes] == [("N-NOTREAD", told)]
+
+
 def test_files_are_found_csv_before_mcap_and_suffixes_as_they_are(tmp_path: Path, canonical: dict[str, Any]) -> None:
     for name in ("a.csv", "a.mcap", "b.mcap", "c.log"):
         (tmp_path / name).touch()
