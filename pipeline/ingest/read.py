@@ -110,17 +110,22 @@ def read_recordings(
         message = f"missing recordings: {'; '.join(missing)}{reason}{of_one_sensor(procedure, found)}"
         refused.insert(0, MissingInputError(message, str(folder)))
     if refused:
-        first, *others = refused
-        if others:
-            listed = [f"{error.file} ({error.code})" for error in others]
-            first.message += f". Also refused: {'; '.join(listed[:MAX_NAMED_FILES])}"
-            first.message += f" and {len(others) - MAX_NAMED_FILES} more" if len(others) > MAX_NAMED_FILES else ""
-        raise first
+        raise _together(refused)
     if left_out:
         note = Note("N-NOTREAD", len(left_out), 0, 0, "; ".join(left_out))
         recordings[0] = replace(recordings[0], notes=(*recordings[0].notes, note))
     _check_different(recordings)
     return _compare_clocks(recordings)
+
+
+def _together(refused: Sequence[InputError]) -> InputError:
+    """Return the first of several errors, which names the files of the others."""
+    first, *others = refused
+    if others:
+        listed = [f"{error.file} ({error.code})" for error in others]
+        first.message += f". Also refused: {'; '.join(listed[:MAX_NAMED_FILES])}"
+        first.message += f" and {len(others) - MAX_NAMED_FILES} more" if len(others) > MAX_NAMED_FILES else ""
+    return first
 
 
 def read_table(
