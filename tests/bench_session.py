@@ -188,6 +188,14 @@ def _noise(sensor: str, times: list[np.ndarray], session: Session, rng: np.rando
     ]
 
 
+def gauss_markov(rng: np.random.Generator, n: int, step: float) -> np.ndarray:
+    """Return n values of standard deviation 1 on three axes, ``step`` correlation times apart: (n, 3) array."""
+    keep = np.exp(-step)
+    drive = rng.normal(size=(n, 3))
+    drive[1:] *= np.sqrt(1 - keep**2)
+    return np.asarray(lfilter([1.0], [1.0, -keep], drive, axis=0))
+
+
 def random_motion(seed: int, n: int = 5) -> Motion:
     """Return samples at which every signal has a random value."""
     rng = np.random.default_rng(seed)

@@ -89,14 +89,17 @@ def test_a_template_is_compiled_once_and_again_where_its_text_has_changed(
     assert rendered("Bye {{ name }}") == "Bye &lt;x&gt;"
 
 
-@pytest.mark.parametrize("home", ["/proc/nobody", "{}/file", "relative"])
-def test_commands_work_where_no_cache_can_be_written(tmp_path: Path, home: str) -> None:
+def test_commands_work_where_no_cache_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     environment = {key: value for key, value in os.environ.items() if key not in ("HOME", "XDG_CACHE_HOME")}
-    places = {"HOME": "/proc/nobody", "XDG_CACHE_HOME": home.format(tmp_path), "PYTHONPATH": str(ROOT)}
-    first = subprocess.run(CONFIG, env=environment | places, cwd=ROOT, capture_output=True, text=True, check=True)
-    places = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)}
-    for _ in range(2):
-        after = subprocess.run(CONFIG, env=environment | places, cwd=ROOT, capture_output=True, text=True, check=True)
-        assert after.stdout == first.stdout
+
+    def said(home: str, cache: str) -> str:
+        places = {"HOME": home, "XDG_CACHE_HOME": cache, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(CONFIG, env=environment | places, cwd=ROOT, capture_output=True, text=True, check=True)
+        return done.stdout
+
+    without = {said("/proc/nobody", cache) for cache in ("/proc/nobody", f"{tmp_path}/file", "relative")}
+    with_it = {said("/proc/nobody", str(tmp_path / "cache")) for _ in range(2)}
+    assert len(without) == 1
+    assert with_it == without
     assert list((tmp_path / "cache" / "imu-calibration").glob("configuration-*"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,7 +101,7 @@ def _in_turn(ways: list[Way], seed: int) -> list[int]:
 
 def _applied(chosen: list[Way], base: str, number: int, seed: int, rng: np.random.Generator, *, varied: bool) -> Copy:
     copy = good_unit(base, 1000 * seed + number, f"u{number:04d}", varied=varied)
-    copy.other = good_unit(base, 500_000 + 1000 * seed + number, varied=varied)
+    copy.of_other = partial(good_unit, base, 500_000 + 1000 * seed + number, varied=varied)
     copy.rng = rng
     said = []
     unseen = []

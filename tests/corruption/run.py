@@ -149,7 +149,7 @@ def run(copies: list[Copy], out: Path, calibrate: Callable[[Path, Path], object]
             continue
         write(copy, campaign / "raw" / copy.name)
         copy.tables.clear()  # they take memory, and are in files now
-        copy.other = None
+        vars(copy).pop("other", None)
         rows.append(row)
         kept.append(copy)
     sheet(campaign, rows)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
 Table = dict[str, np.ndarray]
@@ -62,7 +63,7 @@ class Copy:
     interval_s: float
     tables: dict[str, Table]
     truth: dict[str, Truth]
-    other: Copy | None = None  # another unit of the model, made like this one
+    of_other: Callable[[], Copy] | None = None  # makes another unit of the model, like this one
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
     row: dict[str, str] = field(default_factory=dict)
     overrides: list[str] = field(default_factory=list)
@@ -74,6 +75,12 @@ class Copy:
     said: dict[str, Any] = field(default_factory=dict)
     way: str = ""
     kind: str = ""
+
+    @cached_property
+    def other(self) -> Copy:
+        """The other unit, simulated where a way takes something from it."""
+        assert self.of_other is not None
+        return self.of_other()
 
     def recordings(self, scope: str) -> list[str]:
         """Return the names of the recordings that a scope means; a random one is drawn."""

@@ -47,14 +47,13 @@ def test_fitted_mountings_that_differ_by_more_than_is_stated_widen_the_frame() -
 def test_the_frame_by_faces_is_that_of_the_rotation_which_they_show() -> None:
     settings = settings_of(table="hand", procedure="ferraris")
     s = settings.procedure.faces.accuracy_deg
-    rng, rotations = np.random.default_rng(3), []
     axes = np.concatenate([np.eye(3), -np.eye(3)])
-    for _ in range(4000):  # the mean rotation of six directions, each off by s about both axes across it
-        off = s * rng.standard_normal((6, 3))
-        off -= np.einsum("fi,fi->f", off, axes)[:, None] * axes
-        up = np.array([turn_by_vector(np.radians(o)) @ a for o, a in zip(off, axes, strict=True)])
-        design = np.concatenate([np.stack([np.cross(e, a) for e in np.eye(3)], axis=1) for a in axes])
-        rotations.append(np.degrees(np.linalg.lstsq(design, (up - axes).ravel(), rcond=None)[0]))
+    # 4000 times the mean rotation of six directions, each off by s about both axes across it
+    off = s * np.random.default_rng(3).standard_normal((4000, 6, 3))
+    off -= np.einsum("nfi,fi->nf", off, axes)[..., None] * axes
+    up = np.einsum("nfij,fj->nfi", turn_by_vector(np.radians(off)), axes)
+    design = np.concatenate([np.stack([np.cross(e, a) for e in np.eye(3)], axis=1) for a in axes])
+    rotations = np.degrees(np.linalg.lstsq(design, (up - axes).reshape(4000, -1).T, rcond=None)[0].T)
     found = frame_uncertainty(ACCELEROMETER, [], settings)
     assert found == pytest.approx(list(NORMAL * np.std(rotations, axis=0)), rel=0.05)
 

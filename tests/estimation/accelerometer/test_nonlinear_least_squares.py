@@ -3,11 +3,13 @@ from __future__ import annotations
 import json
 import time as clock
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from bench_session import gauss_markov
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 from unit_settings import settings_of, with_noise
@@ -75,11 +77,7 @@ def _on_table(axis: str, angle: np.ndarray, rate: np.ndarray, start: int, rng: n
     """A turn by the table angle: the up vector turned by minus the angle; 4 mg noise and 0.1 mg bias wander."""
     s, c, o = np.sin(np.radians(angle)), np.cos(np.radians(angle)), np.zeros(len(angle))
     force = np.column_stack({"x": [o, s, c], "y": [-s, o, c], "z": [c, -s, o]}[axis])
-    wander = np.empty_like(force)
-    wander[0] = rng.normal(size=3)
-    keep = np.exp(-0.12 / 100.0)
-    for n in range(1, len(force)):
-        wander[n] = keep * wander[n - 1] + np.sqrt(1 - keep**2) * rng.normal(size=3)
+    wander = gauss_markov(rng, len(force), 0.12 / 100.0)
     reading = BIAS + np.linalg.solve(MATRIX, force.T).T + 4e-3 * rng.normal(size=force.shape) + 1e-4 * wander
     return Recording(
         f"accel_{axis}",
@@ -153,13 +151,18 @@ def test_nine_parameters_are_exact_without_noise(gravity_g: float) -> None:
     assert calibration.converged
 
 
+@cache
+def _repeat(seed: int, between: float) -> SensorCalibration:
+    settings = _settings(wander=between)
+    recording = _by_hand(_spread(24), np.random.default_rng(seed), between=between)
+    return fit(StageInput("accelerometer", with_noise([recording], settings), None, settings))
+
+
 @pytest.mark.parametrize("between", [0.0, 3e-4])
 def test_the_truth_lies_within_the_expanded_uncertainty_in_its_share_of_hand_held_recordings(between: float) -> None:
-    settings = _settings(wander=between)
     inside = []
     for seed in range(25):
-        recording = _by_hand(_spread(24), np.random.default_rng(seed), between=between)
-        calibration = fit(StageInput("accelerometer", with_noise([recording], settings), None, settings))
+        calibration = _repeat(seed, between)
         factors = coverage_factor(calibration.freedom[FITTED])
         inside.append(np.abs(_vector(calibration) - TRUTH) < factors * _uncertainty(calibration))
     assert 0.90 < np.mean(inside) < 0.99
@@ -233,18 +236,7 @@ def test_scale_factors_and_misalignment_make_up_the_matrix() -> None:
 def test_the_uncertainty_of_a_misalignment_is_the_scatter_of_its_repeats() -> None:
     values, claimed = [], []
     for seed in range(60):
-        parameters = (
-            fit(
-                StageInput(
-                    "accelerometer",
-                    with_noise([_by_hand(_spread(24), np.random.default_rng(seed))], _settings()),
-                    None,
-                    _settings(),
-                )
-            )
-            .stages[-1]
-            .parameters
-        )
+        parameters = _repeat(seed, 0.0).stages[-1].parameters
         values.append(parameters["misalignment_zx"].value)
         claimed.append(parameters["misalignment_zx"].standard_uncertainty)
     assert np.std(values) / np.mean(claimed) == pytest.approx(1.0, abs=0.28)  # three standard deviations of a scatter

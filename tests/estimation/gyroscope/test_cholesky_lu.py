@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from bench_session import gauss_markov
 from unit_settings import settings_of, with_noise
 
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError, NotObservableError
@@ -55,11 +57,7 @@ def _turns(
     truth[:, "xyz".index(axis)] = speed
     reading = BIAS + truth @ FORWARD.T
     if rng is not None:
-        wander = np.empty_like(reading)
-        wander[0] = rng.normal(size=3)
-        keep = np.exp(-INTERVAL / 100.0)
-        for n in range(1, len(wander)):
-            wander[n] = keep * wander[n - 1] + np.sqrt(1 - keep**2) * rng.normal(size=3)
+        wander = gauss_markov(rng, len(reading), INTERVAL / 100.0)
         reading = reading + 0.05 * rng.normal(size=reading.shape) + 3e-3 * wander
     return Recording(
         f"gyro_{axis}",
@@ -81,6 +79,11 @@ def _campaign(
 def _fit(recordings: list[Recording], settings: Settings = SETTINGS) -> SensorCalibration:
     unit = with_noise(recordings, settings)
     return fit(StageInput("gyroscope", unit, fit_stage("gyroscope", "bias", unit, None, settings), settings))
+
+
+@cache
+def _repeat(seed: int) -> SensorCalibration:
+    return _fit(_campaign(np.random.default_rng(seed)))
 
 
 def _values(calibration: SensorCalibration) -> dict[str, float]:
@@ -160,7 +163,7 @@ def test_the_truth_lies_within_the_expanded_uncertainty_in_its_share_of_repeats(
     truth = np.concatenate([BIAS, np.linalg.solve(FORWARD, np.eye(3)).ravel()])
     inside, errors, claimed = [], [], []
     for seed in range(25):
-        calibration = _fit(_campaign(np.random.default_rng(seed)))
+        calibration = _repeat(seed)
         assert calibration.covariance is not None
         uncertainty = np.sqrt(np.diag(calibration.covariance))
         error = np.concatenate([calibration.bias, calibration.matrix.ravel()]) - truth
@@ -174,7 +177,7 @@ def test_the_truth_lies_within_the_expanded_uncertainty_in_its_share_of_repeats(
 def test_the_uncertainty_of_the_factors_is_the_scatter_of_their_repeats() -> None:
     scatter, claimed = [], []
     for seed in range(25):
-        parameters = _fit(_campaign(np.random.default_rng(100 + seed))).stages[-1].parameters
+        parameters = _repeat(seed).stages[-1].parameters
         scatter.append([p.value for p in parameters.values()])
         claimed.append([p.standard_uncertainty for p in parameters.values()])
     truth = np.concatenate([S, T[np.tril_indices(3, -1)], M.ravel()])
