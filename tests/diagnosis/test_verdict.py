@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,9 @@ import pytest
 from bench_session import Session, record
 from hand_simulator import Hand
 from hand_simulator import draw as draw_hand
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "study"))
+from bench_units import of_accelerometer
 
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import draw
@@ -200,7 +205,7 @@ def test_a_selection_that_leaves_a_residual_is_no_explanation(  # noqa: PLR0917 
 def test_a_recording_of_another_unit_is_unexplained_with_a_reason_and_nothing_is_offered() -> None:
     own, other = (recordings_of(draw("null_normal", number, 31)) for number in (1, 3))
     recordings = [next(o for o in other if o.name == "gyro_y") if r.name == "gyro_y" else r for r in own]
-    found = unit_of_recordings(recordings, ["sensor=mpu6050"]).run_to("diagnose").diagnosis["accelerometer"]
+    found = (of_accelerometer(unit_of_recordings(recordings, ["sensor=mpu6050"])).diagnosis or {})["accelerometer"]
     assert found["verdict"] == "unexplained"
     assert "sensor file" in found["reason"]
     assert (found["override"], commands_of(found, "accelerometer", "U1", {"campaign": "c"})) == ("", {})

@@ -86,8 +86,8 @@ def test_errors_of_the_angle_that_noise_hides_change_nothing() -> None:
 
 
 def test_an_effect_across_the_motion_is_named_beside_errors_of_the_angle_and_none_is_invented() -> None:
-    hysteresis = judged("seats", 62, 51, 1.0)
+    hysteresis = judged("seats", 62, 51, 1.0, sensors=["accelerometer"])
     assert hysteresis["hidden"] == "accelerometer.hysteresis"  # 1e-4 g, with 1.7e-4 g of an angle error at each stop
     assert hysteresis["sensors"]["accelerometer"]["selected"] == ["hysteresis"]
-    sensor = judged("single", 62, 11, 1.0)["sensors"]["accelerometer"]
+    sensor = judged("single", 62, 11, 1.0, sensors=["accelerometer"])["sensors"]["accelerometer"]
     assert sensor["selected"] == []  # without these errors in the model: table_tilt

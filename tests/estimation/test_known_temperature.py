@@ -5,6 +5,7 @@ The reference is the truth, and the same unit without an influence of temperatur
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from pipeline.core.settings import DataSheet, KnownTemperature
 from pipeline.estimation import known_temperature
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from pipeline.app.one_unit import UnitResult
@@ -78,14 +80,20 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def known(table: Path) -> UnitResult:
-    return pipeline.calibrate_unit(table / "W", "U1", overrides=["method=known_temperature", *KNOWN])
+def calibrated(table: Path) -> Callable[..., UnitResult]:
+    """Return the function that calibrates unit W or N of the table, each method once."""
+    return cache(lambda unit, *overrides: pipeline.calibrate_unit(table / unit, "U1", overrides=list(overrides)))
 
 
 @pytest.fixture(scope="module")
-def with_another(table: Path) -> UnitResult:
+def known(calibrated: Callable[..., UnitResult]) -> UnitResult:
+    return calibrated("W", "method=known_temperature", *KNOWN)
+
+
+@pytest.fixture(scope="module")
+def with_another(calibrated: Callable[..., UnitResult]) -> UnitResult:
     effects = ["effects.accelerometer=[quadratic_nonlinearity]", "effects.gyroscope=[g_sensitivity]"]
-    return pipeline.calibrate_unit(table / "W", "U1", overrides=["method=known_temperature", *KNOWN, *effects])
+    return calibrated("W", "method=known_temperature", *KNOWN, *effects)
 
 
 def errors(found: UnitResult, reference: dict[str, dict[str, Any]], sensor: str) -> np.ndarray:
@@ -110,14 +118,14 @@ def of_effects(found: UnitResult, sensor: str) -> dict[str, list[dict[str, Any]]
 
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_bias_and_matrix_are_those_of_a_unit_that_does_not_depend_on_the_temperature(
-    table: Path, known: UnitResult, sensor: str
+    table: Path, known: UnitResult, calibrated: Callable[..., UnitResult], sensor: str
 ) -> None:
     of_truth = errors(known, read_json(table / "W" / "truth" / "U1.json"), sensor)
     assert np.mean(np.abs(of_truth) < 1.0) > 0.8
     assert np.abs(of_truth).max() < 2.0
-    other = pipeline.calibrate_unit(table / "N", "U1", overrides=["method=reference_least_squares"])
+    other = calibrated("N", "method=reference_least_squares")
     assert np.abs(errors(known, as_reference(other), sensor)).max() < 0.3  # noise of the thermometer, rounding
-    plain = pipeline.calibrate_unit(table / "W", "U1", overrides=["method=reference_least_squares"])
+    plain = calibrated("W", "method=reference_least_squares")
     assert np.abs(errors(plain, read_json(table / "W" / "truth" / "U1.json"), sensor)).max() > 5.0
 
 
@@ -174,9 +182,9 @@ def test_what_a_wrong_coefficient_leaves_is_fitted_and_added_to_it(table: Path) 
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_the_staged_method_honours_it(table: Path, sensor: str) -> None:
-    staged = pipeline.calibrate_unit(table / "W", "U1", overrides=["method=by_stages", *KNOWN])
-    other = pipeline.calibrate_unit(table / "N", "U1", overrides=["method=staged"])
+def test_the_staged_method_honours_it(calibrated: Callable[..., UnitResult], sensor: str) -> None:
+    staged = calibrated("W", "method=by_stages", *KNOWN)
+    other = calibrated("N", "method=staged")
     assert np.abs(errors(staged, as_reference(other), sensor)).max() < 0.3
     assert TRUTH[sensor].keys() <= of_effects(staged, sensor).keys()
 

@@ -18,6 +18,7 @@ import argparse
 import json
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_research.figures import wilson
-from pipeline.app.one_unit import unit_of_recordings
+from pipeline.app.one_unit import ConfiguredUnit, unit_of_recordings
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS, NotCalibrated, coverage_factor
 from pipeline.estimation.gauss_markov import TIME_FACTORS, TIME_PRIOR
@@ -35,6 +36,7 @@ from pipeline.physics.effects import built_in
 from pipeline.physics.kinematics import reference_motion
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
+from pipeline.unit import UnitState
 
 TURNS = [f"{kind}_{axis}" for kind in ("accel", "gyro") for axis in "xyz"]
 COURSE: dict[str, Any] = {
@@ -107,8 +109,18 @@ def _drawn_wander(model: str, sensor: str, rng: np.random.Generator) -> dict[str
     }
 
 
-def judged(kind: str, seed: int, number: int, hidden: float, coverage: str = "") -> dict[str, Any]:
-    """Return what is said of one unit, by the steps of a run.
+def of_accelerometer(unit: ConfiguredUnit) -> UnitState:
+    """Run the steps to the diagnosis, which is made of the accelerometer alone: it takes nothing of the gyroscope."""
+    state = unit.run_to("validate")
+    fits = state.fits | {"gyroscope": NotCalibrated("not asked for")}
+    diagnosed = unit.run_to("diagnose", first="diagnose", state=replace(state, fits=fits)).diagnosed
+    return replace(state, diagnosed=diagnosed)
+
+
+def judged(
+    kind: str, seed: int, number: int, hidden: float, coverage: str = "", *, sensors: Sequence[str] = SENSORS
+) -> dict[str, Any]:
+    """Return what is said of one unit, or of its accelerometer alone, by the steps of a run.
 
     The rate of each turn axis has an error as its table states, without one of the angle, as by a wrong clock of the
     table: the true matrix of the gyroscope is ``diag(1 + error)`` times that of the simulation.
@@ -123,13 +135,14 @@ def judged(kind: str, seed: int, number: int, hidden: float, coverage: str = "")
     line: dict[str, Any] = {"kind": kind, "seed": seed, "number": number, "model": description.sensor}
     line |= {"hidden": bench["hidden"], "refused": None, "sensors": {}}
     try:
-        state = unit.run_to("fit" if coverage else "diagnose")
+        one = tuple(sensors) == ("accelerometer",)
+        state = of_accelerometer(unit) if one else unit.run_to("fit" if coverage else "diagnose")
     except PipelineError as error:
         return line | {"refused": error.message}
     if refused := [fit.reason for fit in state.fits.values() if isinstance(fit, NotCalibrated)]:
         return line | {"refused": refused[0]}
     mean = _mean_mounting(nominal, state.checked, bench) if "seats" in kind else Rotation.identity()
-    for sensor in SENSORS:
+    for sensor in sensors:
         found = state.fits[sensor]
         matrix = mean.as_matrix() @ np.array(truth[sensor]["matrix"])
         if sensor == "gyroscope":

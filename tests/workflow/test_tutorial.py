@@ -20,6 +20,7 @@ import pytest
 from .conftest import ROOT
 
 pytestmark = pytest.mark.workflow
+typed_along = pytest.mark.documents  # half a minute; ``.ci/run`` runs it
 
 PAGE = ROOT / "docs" / "find_the_missing_effect.md"
 NEEDED = ("Snakefile", "configs", "pipeline", "profiles", "workflow")
@@ -123,20 +124,28 @@ def table(page: str, heading: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_commands_print_what_the_page_says(page: str, typed: Typed) -> None:
-    assert page.count("```") == 4 * len(typed.printed) == 44  # no block but commands and what they print
+def test_the_page_has_no_block_but_commands_and_what_they_print_and_its_pictures_exist(page: str) -> None:
+    steps = [*STEP.finditer(page)]
+    assert page.count("```") == 4 * sum(bool(step["commands"]) for step in steps) == 44
+    assert [(PAGE.parent / step["file"]).is_file() for step in steps if step["file"]] == [True] * 3
+
+
+@typed_along
+def test_commands_print_what_the_page_says(typed: Typed) -> None:
+    assert len(typed.printed) == 11
     for _, said, printed in typed.printed:
         compare(said, printed)
 
 
+@typed_along
 def test_pictures_show_the_findings_that_the_units_page_has_by_then(typed: Typed) -> None:
     assert len(typed.pictures) == 3
-    for file, said, shown in typed.pictures:
-        assert (PAGE.parent / file).is_file()
+    for _, said, shown in typed.pictures:
         for finding in said.split(" | "):
             assert any(agree(finding, other) for other in shown), (finding, shown)
 
 
+@typed_along
 def test_the_table_of_runs_is_that_of_the_history(page: str, typed: Typed) -> None:
     runs = []
     for file in sorted((typed.directory / "results" / "tutorial" / "history").iterdir()):
@@ -150,6 +159,7 @@ def test_the_table_of_runs_is_that_of_the_history(page: str, typed: Typed) -> No
         assert all(map(close, row[1:3], run[1:3]))
 
 
+@typed_along
 def test_the_table_of_parameters_is_that_of_fit_and_truth(page: str, typed: Typed) -> None:
     fitted = typed.content("results/tutorial/calibrations/bench-7.json")["gyroscope"]["effects"]
     hidden = typed.content("data/tutorial/truth/bench-7.json")["gyroscope"]["effects"]
