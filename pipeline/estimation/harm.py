@@ -77,16 +77,16 @@ def _raises(before: Values, after: Values, shared: float = 0.0, comparisons: int
     return bool(np.mean(change) > limit * np.sqrt(np.var(change, ddof=1) / m + shared))
 
 
-def harmful_on_held_out(names: Sequence[str], errors: Values, time: Values, noise: Noise) -> dict[str, str]:
+def harmful_on_held_out(names: Sequence[str], errors: Sequence[Values], time: Values, noise: Noise) -> dict[str, str]:
     """Return the effects that raise the error on held-out motion, with the reason; ``time``: (n,), s.
 
-    ``errors``: before effects are added, and with each further one: (c, n, 3) of vectors or (c, n, 1) of magnitudes.
+    ``errors``: before effects are added, and with each further one: (n, 3) of vectors or (n, 1) of magnitudes.
     """
     count = min(HELD_OUT_PIECES, len(time))
-    squares = [np.array([p.mean() for p in np.array_split(np.sum(e**2, axis=1), count)]) for e in errors]
+    squares = [np.array([p.mean() for p in np.array_split(np.einsum("ij,ij->i", e, e), count)]) for e in errors]
     start, end = (np.array([p[k] for p in np.array_split(time, count)]) for k in (0, -1))
     correlation = block_covariance(start, end - start, noise.correlation_time)
-    variance = noise.wander**2 if errors.shape[2] > 1 else np.mean(noise.wander**2)
+    variance = noise.wander**2 if errors[0].shape[1] > 1 else np.mean(noise.wander**2)
 
     def shared(before: int, after: int) -> float:
         """Return the variance of ``2 mean(d^T m)`` by the wander m, with the change d of the calibrated readings."""

@@ -17,7 +17,6 @@ coefficients x_k, is uncertain by ``e^2 = u sqrt(n) (|z| + sum |x_k| |a_k|)^2``.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -38,11 +37,11 @@ if TYPE_CHECKING:
     from pipeline.estimation.selection import Selection
     from pipeline.evaluation.diagnosis.functional_forms import Curves
 
+SETS_OF_AXES = [tuple(c for c in range(3) if code >> c & 1) for code in range(8)]
 UNIT_ROUNDOFF = float(np.finfo(np.float64).eps) / 2.0  # u
 
 
-@dataclass(frozen=True)
-class FormGain:
+class FormGain(NamedTuple):
     """The improvement of the fit by a functional form."""
 
     delta_bic: float
@@ -216,11 +215,10 @@ class Scan:
         gained = np.maximum(2.0 * (likelihoods.max(axis=0) - self.before), 0.0)
         k = columns * np.arange(1, 4)[:, None] + scanned
         delta, p = gained - k * float(np.log(self.samples)), scipy.special.chdtrc(k, gained)
-        best, at = delta.argmax(axis=0), likelihoods.argmax(axis=0)
-        return [
-            FormGain(float(delta[a, m]), float(p[a, m]), tuple(sorted(order[: a + 1, m].tolist())), int(at[a, m]))
-            for m, a in enumerate(best.tolist())
-        ]
+        best = delta.argmax(axis=0)[None]
+        delta, p, at = (np.take_along_axis(v, best, 0)[0].tolist() for v in (delta, p, likelihoods.argmax(axis=0)))
+        axes = [SETS_OF_AXES[each] for each in np.take_along_axis(np.cumsum(2**order, axis=0), best, 0)[0].tolist()]
+        return [*map(FormGain, delta, p, axes, at)]
 
     def drops(self, columns: Values) -> Values:
         """Return the drops of m forms of r columns under each noise on each axis: (t, 3, m).

@@ -26,7 +26,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, combinations, count, pairwise, starmap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -70,8 +70,7 @@ RECORDING_FOLDS = 5  # parts of every recording that are left out in turn
 LISTED_FORMULAS = 6  # entries of the front
 
 
-@dataclass(frozen=True)
-class ScoredForm:
+class ScoredForm(NamedTuple):
     """A form and its gain."""
 
     form: Form
@@ -281,16 +280,16 @@ class Forms:
         declared = [getattr(e, "declared", None) for e in catalogue().values() if self.sensor in e.sensors]
         terms = [term for each in declared if each for term in each.terms.values()]
         known = [term.formulas[""].text for term in terms if "" in term.formulas and not term.shared]
-        seen = {_digest(self.column(text)[rows]) for text in known}
-        each = {factor.texts: factor for factor in (*factors, *modulators) if factor}
+        pairs.sort(key=lambda form: form.complexity)
+        each = {factor.texts: factor for factor in (*factors, *modulators) if factor} | {(): None}
         probed = {
-            texts: np.stack([self.column(text, factor)[rows] for text in texts], axis=-1)
+            texts: np.stack([self.column(text, factor)[rows] for text in texts], axis=-1) if factor else np.ones(())
             for texts, factor in each.items()
         }
+        seen = {*_digests([self.column(text)[rows] for text in known])}
+        values = [probed[form.factor.texts] * probed[form.modulator.texts if form.modulator else ()] for form in pairs]
         distinct = []
-        for form in sorted(pairs, key=lambda form: form.complexity):
-            values = probed[form.factor.texts]
-            digest = _digest(values * probed[form.modulator.texts] if form.modulator else values)
+        for form, digest in zip(pairs, _digests(values), strict=True):
             if digest not in seen:
                 seen.add(digest)
                 distinct.append(form)
@@ -324,11 +323,17 @@ class Forms:
         return found
 
 
-def _digest(values: Values) -> bytes:
+def _digests(values: Sequence[Values]) -> list[bytes]:
     """Return the same bytes for forms whose values differ by a factor alone."""
-    flat, size = values.ravel(), float(np.linalg.norm(values))
-    first = float(flat[np.argmax(np.abs(flat) > 1e-6 * size)]) if size > 0.0 else 1.0
-    return np.round(flat / (size * np.sign(first) or 1.0), 9).tobytes()
+    found: dict[int, bytes] = {}
+    for number in {each.size for each in values}:
+        index = [k for k, each in enumerate(values) if each.size == number]
+        flat = np.stack([values[k].ravel() for k in index])
+        size = np.linalg.norm(flat, axis=1, keepdims=True)
+        first = np.take_along_axis(flat, np.argmax(np.abs(flat) > 1e-6 * size, axis=1)[:, None], axis=1)
+        scale = np.where(size > 0.0, size * np.sign(first), 1.0)
+        found |= zip(index, (row.tobytes() for row in np.round(flat / scale, 9)), strict=True)
+    return [found[k] for k in range(len(values))]
 
 
 def _best_of_each(scored: Iterable[ScoredForm]) -> list[ScoredForm]:

@@ -323,9 +323,9 @@ def _held_out(
     if np.mean(wander**2) > np.mean(noise.wander**2):
         noise = replace(noise, wander=wander, correlation_time=setting.time)
     return (
-        np.sqrt(np.mean(np.sum(errors[1:] ** 2, axis=2), axis=1)).tolist(),
-        floor if vector_floor is None or errors.shape[2] == 1 else vector_floor,
-        harmful_on_held_out(selection.names, np.delete(errors, 1, axis=0), time, noise),
+        [float(np.sqrt(np.einsum("ij,ij", error, error) / len(error))) for error in errors[1:]],
+        floor if vector_floor is None or errors[0].shape[1] == 1 else vector_floor,
+        harmful_on_held_out(selection.names, [errors[0], *errors[2:]], time, noise),
     )
 
 

@@ -129,10 +129,10 @@ def last_error_of_magnitude(calibration: SensorCalibration, samples: Samples) ->
     return None if found is None else vector_errors([found], directed=False)[:, 0]
 
 
-def errors_of(calibrations: Sequence[SensorCalibration], samples: Sequence[Samples]) -> tuple[Values, Values]:
-    """Return the errors of c calibrations, with the effects that can be subtracted, and the n times at which all are.
+def errors_of(calibrations: Sequence[SensorCalibration], samples: Sequence[Samples]) -> tuple[list[Values], Values]:
+    """Return the errors of calibrations, with the effects that can be subtracted, and the n times at which all are.
 
-    (c, n, 3), of the vector, if all samples have its direction, else (c, n, 1), of the magnitude.
+    Those of a calibration are (n, 3), of the vector, if all samples have its direction, else (n, 1), of the magnitude.
     """
 
     def of(calibration: SensorCalibration, *, directed: bool) -> Values:
@@ -146,7 +146,7 @@ def errors_of(calibrations: Sequence[SensorCalibration], samples: Sequence[Sampl
     for each in errors:
         known &= np.isfinite(each).all(axis=1)
     time = np.concatenate([each.time for each in samples])
-    return np.stack(errors if known.all() else [each[known] for each in errors]), time[known]
+    return (errors if known.all() else [each[known] for each in errors]), time[known]
 
 
 def vector_errors(corrected: Sequence[Corrected], *, directed: bool) -> Values:
