@@ -4,6 +4,7 @@ import csv
 import re
 import shutil
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -120,14 +121,27 @@ def one_chart(layer: LineMark | SampleMarks) -> str:
     return f"<!doctype html><title>line</title><style>{style}</style>{figure}<script>{script}</script>"
 
 
-def opened(browser: Browser, path: Path, **settings: Any) -> Page:
-    """Open a page, its parts unfolded; the test fails at its end if it asks for anything or reports an error."""
-    page = browser.new_context(**settings).new_page()
+def watched(page: Page) -> Page:
+    """Have what a page asks for, and the errors that it reports, listed."""
     page.set_default_timeout(20_000)
-    page.asked, page.wrong = [], []  # type: ignore[attr-defined]
     page.on("request", lambda r: page.asked.append(r.url))  # type: ignore[attr-defined]
     page.on("console", lambda m: page.wrong.append(m.text) if m.type in ("error", "warning") else None)  # type: ignore[attr-defined]
     page.on("pageerror", lambda e: page.wrong.append(str(e)))  # type: ignore[attr-defined]
+    return page
+
+
+@cache
+def shared(browser: Browser) -> Page:
+    """Return a page for all tests without settings of their own: a new one takes more than most of them."""
+    return watched(browser.new_context().new_page())
+
+
+def opened(browser: Browser, path: Path, **settings: Any) -> Page:
+    """Open a page, its parts unfolded; ``left_alone`` tells whether it asks for anything or reports an error."""
+    page = watched(browser.new_context(**settings).new_page()) if settings else shared(browser)
+    page.emulate_media(media="screen")
+    page.mouse.move(0, 0)
+    page.asked, page.wrong = [], []  # type: ignore[attr-defined]
     page.goto(path.as_uri())
     page.evaluate("document.querySelectorAll('details.part').forEach((part) => { part.open = true })")
     return page
@@ -167,7 +181,8 @@ def test_a_page_asks_for_nothing_reports_no_error_and_fits(
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     ground = [int(v) for v in re.findall(r"\d+", page.evaluate("getComputedStyle(document.body).backgroundColor"))[:3]]
     assert (max(ground) < 60) == (settings.get("color_scheme") == "dark")
-    page.context.close()
+    if settings:
+        page.context.close()
 
 
 @pytest.mark.parametrize("name", ["unit.html", "campaign.html"])
@@ -184,7 +199,6 @@ def test_every_chart_has_a_name_and_a_description_for_those_who_cannot_see_it(
     assert all(role == "img" and len(title) > 5 and len(words) > 5 for role, title, words in told)
     identifiers = page.eval_on_selector_all("[id]", "all => all.map((e) => e.id)")
     assert len(identifiers) == len(set(identifiers))
-    page.context.close()
 
 
 def test_what_a_page_hides_without_its_script_is_little(browser: Browser, pages: Path) -> None:
@@ -212,7 +226,6 @@ def test_the_table_of_all_units_sorts_by_keyboard_with_empty_cells_last(browser:
     page.locator("#all thead tr:nth-child(2) th:nth-child(1) button").click()
     names = column(page, 1)
     assert names == [f"U{i}" for i in range(len(names))]  # U10 after U9
-    page.context.close()
 
 
 def test_of_a_long_table_the_rows_in_view_are_in_the_page_and_all_of_them_in_print(
@@ -238,7 +251,6 @@ def test_of_a_long_table_the_rows_in_view_are_in_the_page_and_all_of_them_in_pri
     page.evaluate("dispatchEvent(new Event('afterprint'))")
     assert len(column(page, 1)) <= 100
     assert left_alone(page, pages / "campaign.html")
-    page.context.close()
 
 
 def test_the_table_of_all_units_needs_no_horizontal_scrolling_on_a_desktop(browser: Browser, pages: Path) -> None:
@@ -264,7 +276,6 @@ def test_the_filter_finds_rows_by_words_and_leaves_out_others(browser: Browser, 
     assert column(page, 1) == []
     box.fill("")
     assert 20 < len(column(page, 1)) <= 100
-    page.context.close()
 
 
 def test_a_dot_of_the_fleet_is_named(browser: Browser, pages: Path) -> None:
@@ -274,7 +285,6 @@ def test_a_dot_of_the_fleet_is_named(browser: Browser, pages: Path) -> None:
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowRight")
     assert page.locator(".readout b").first.text_content() == fleet()[1]["unit"]
-    page.context.close()
 
 
 def test_a_chart_of_many_units_shows_quantiles_and_names_the_farthest(
@@ -304,7 +314,6 @@ def test_a_chart_of_many_units_shows_quantiles_and_names_the_farthest(
     rows = csv.DictReader(saved.value.path().read_text().splitlines())
     assert {row["unit"]: row["stated"] for row in rows if row["unit"]} == farthest
     assert left_alone(page, file)
-    page.context.close()
 
 
 def test_a_dot_tells_the_value_of_the_unit_and_not_a_rounded_coordinate(browser: Browser, pages: Path) -> None:
@@ -320,7 +329,6 @@ def test_a_dot_tells_the_value_of_the_unit_and_not_a_rounded_coordinate(browser:
         assert row.split()[-2] in values
         told.add(row.split()[-2])
     assert len(told) > 2
-    page.context.close()
 
 
 def test_units_that_are_chosen_are_marked_in_every_chart_and_list(browser: Browser, pages: Path) -> None:
@@ -343,7 +351,6 @@ def test_units_that_are_chosen_are_marked_in_every_chart_and_list(browser: Brows
     wanted = [i for i in range(960, UNITS) if i % 9 == 0 and i % 200 != 7]
     assert page.eval_on_selector_all("svg .chosen", rings) == [3 * len(wanted)] * 2
     assert left_alone(page, pages / "campaign.html")
-    page.context.close()
 
 
 def test_any_two_runs_are_compared_with_the_largest_change_first(browser: Browser, pages: Path) -> None:
@@ -366,7 +373,6 @@ def test_any_two_runs_are_compared_with_the_largest_change_first(browser: Browse
     assert "U9: run 3 no longer has gyroscope.g_sensitivity, which run 2 had." in told
     assert f"python -m pipeline add factory U9 gyroscope.g_sensitivity --results {pages.parent}" in told
     assert left_alone(page, pages / "campaign.html")
-    page.context.close()
 
 
 def test_arrow_keys_and_pointer_read_the_values_that_were_drawn(browser: Browser, pages: Path) -> None:
@@ -385,7 +391,6 @@ def test_arrow_keys_and_pointer_read_the_values_that_were_drawn(browser: Browser
     told = [float(v) for v in re.findall(r"[\d.]+", readout.text_content() or "")]
     assert told == pytest.approx([7.0, 20.0], abs=0.025)  # coordinates are drawn to a tenth of a pixel
     assert left_alone(page, pages / "chart.html")
-    page.context.close()
 
 
 def test_dragging_zooms_into_what_was_marked_and_escape_goes_back(browser: Browser, pages: Path) -> None:
@@ -408,7 +413,6 @@ def test_dragging_zooms_into_what_was_marked_and_escape_goes_back(browser: Brows
     )
     page.keyboard.press("Escape")
     assert labels() == before
-    page.context.close()
 
 
 def test_a_chart_moves_with_shift_and_is_saved_with_its_values(browser: Browser, pages: Path) -> None:
@@ -439,7 +443,6 @@ def test_a_chart_moves_with_shift_and_is_saved_with_its_values(browser: Browser,
     head = saved.value.path().read_bytes()[:24]
     assert head.startswith(b"\x89PNG")
     assert int.from_bytes(head[16:20], "big") == 4 * 420
-    page.context.close()
 
 
 def test_a_zoom_shows_the_samples_within_it_and_the_file_holds_all(browser: Browser, pages: Path) -> None:
@@ -466,7 +469,6 @@ def test_a_zoom_shows_the_samples_within_it_and_the_file_holds_all(browser: Brow
     rows = [row.split(",") for row in saved.value.path().read_text().splitlines()[1:]]
     assert np.array([row[3:5] for row in rows], float) == pytest.approx(np.stack([x, y], 1), abs=4e-4)
     assert left_alone(page, pages / "samples.html")
-    page.context.close()
 
 
 def test_a_wide_table_is_folded_on_a_phone_and_on_no_other_screen(browser: Browser, pages: Path) -> None:
@@ -496,7 +498,6 @@ def test_a_series_is_switched_off_and_a_chart_enlarged_and_put_back(browser: Bro
     page.keyboard.press("Escape")
     page.locator("body > figure svg").wait_for()
     assert (page.locator("svg").bounding_box() or {})["width"] == narrow
-    page.context.close()
 
 
 def test_the_contents_stay_in_view_and_tell_where_the_reader_is(browser: Browser, pages: Path) -> None:
@@ -508,7 +509,6 @@ def test_the_contents_stay_in_view_and_tell_where_the_reader_is(browser: Browser
     below = page.locator(".contents .parts a").all_text_contents()
     assert below == page.locator("#gyroscope h3").all_text_contents()
     assert left_alone(page, pages / "unit.html")
-    page.context.close()
 
 
 def test_a_link_into_a_folded_part_opens_it(browser: Browser, pages: Path) -> None:
@@ -532,7 +532,6 @@ def test_every_row_is_printed(browser: Browser, tmp_path: Path, units: int) -> N
     last = rows.nth(units - 1).bounding_box() or {}
     assert rows.count() == units
     assert last["y"] + last["height"] <= box["y"] + box["height"] + 1.0
-    page.context.close()
 
 
 @pytest.mark.parametrize("width", [390, 900, 1300, 1900])
