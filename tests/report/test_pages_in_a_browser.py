@@ -33,7 +33,8 @@ TEXTS = """charts => charts.flatMap((svg) => {
   return [...all.filter(([, r]) => r.left < box.left - 2 || r.right > box.right + 2).map(([text]) => text),
     ...ticks.flatMap(([text, a]) => names.filter(([, b]) => across(a, b)).map(([name]) => `${text} on ${name}`))];
 })"""  # texts of charts that are cut, and ticks on the name of their axis
-PHONE = {"width": 390, "height": 844}
+PHONE: Any = {"width": 390, "height": 844}
+DESKTOP: Any = {"width": 1280, "height": 720}
 
 
 @pytest.fixture(scope="module")
@@ -136,14 +137,19 @@ def shared(browser: Browser) -> Page:
     return watched(browser.new_context().new_page())
 
 
-def opened(browser: Browser, path: Path, **settings: Any) -> Page:
+def opened(
+    browser: Browser, path: Path, *, folded: bool = False, size: Any = DESKTOP, scheme: Any = "light", **settings: Any
+) -> Page:
     """Open a page, its parts unfolded; ``left_alone`` tells whether it asks for anything or reports an error."""
     page = watched(browser.new_context(**settings).new_page()) if settings else shared(browser)
-    page.emulate_media(media="screen")
+    if not settings:
+        page.emulate_media(media="screen", color_scheme=scheme)
+        page.set_viewport_size(size)
     page.mouse.move(0, 0)
     page.asked, page.wrong = [], []  # type: ignore[attr-defined]
     page.goto(path.as_uri())
-    page.evaluate("document.querySelectorAll('details.part').forEach((part) => { part.open = true })")
+    if not folded:
+        page.evaluate("document.querySelectorAll('details.part').forEach((part) => { part.open = true })")
     return page
 
 
@@ -512,14 +518,12 @@ def test_the_contents_stay_in_view_and_tell_where_the_reader_is(browser: Browser
 
 
 def test_a_link_into_a_folded_part_opens_it(browser: Browser, pages: Path) -> None:
-    page = browser.new_page()
-    page.goto((pages / "unit.html").as_uri())
+    page = opened(browser, pages / "unit.html", folded=True)
     assert page.locator("details.part[open]").count() == 0
     page.locator(".contents a[href='#provenance']").click()
     page.locator("#provenance-part[open]").wait_for()
     page.goto(f"{(pages / 'unit.html').as_uri()}#gyroscope-parameters")
     page.locator("#gyroscope-parameters-part[open]").wait_for()
-    page.context.close()
 
 
 @pytest.mark.parametrize("units", [9, 100])
@@ -536,8 +540,7 @@ def test_every_row_is_printed(browser: Browser, tmp_path: Path, units: int) -> N
 
 @pytest.mark.parametrize("width", [390, 900, 1300, 1900])
 def test_pages_fit_every_window_with_few_words_and_a_first_screen(browser: Browser, pages: Path, width: int) -> None:
-    page = browser.new_context(viewport={"width": width, "height": 900}).new_page()
-    page.goto((pages / "unit.html").as_uri())
+    page = opened(browser, pages / "unit.html", folded=True, size={"width": width, "height": 900})
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     assert len(page.inner_text("body").split()) < 1200
     if width == 1300:
@@ -552,7 +555,6 @@ def test_pages_fit_every_window_with_few_words_and_a_first_screen(browser: Brows
     unreached = "all => all.filter((e) => e.scrollWidth > e.clientWidth && e.tabIndex !== 0).map((e) => e.innerText)"
     assert page.eval_on_selector_all(".scroll", unreached) == []  # by keys
     assert page.locator("th:empty").count() == 0
-    page.context.close()
 
 
 def test_on_paper_a_page_has_no_controls(browser: Browser, pages: Path) -> None:
@@ -566,17 +568,13 @@ def test_on_paper_a_page_has_no_controls(browser: Browser, pages: Path) -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("name", ["unit", "campaign", "failed"])
 def test_axe_finds_nothing(browser: Browser, pages: Path, name: str, scheme: Literal["light", "dark"]) -> None:
-    page = browser.new_page(color_scheme=scheme)
-    page.goto((pages / f"{name}.html").as_uri())
+    page = opened(browser, pages / f"{name}.html", folded=True, scheme=scheme)
     found = Axe().run(page).response["violations"]
     assert [(rule["id"], [node["target"] for node in rule["nodes"]][:5]) for rule in found] == []
-    page.close()
 
 
 @pytest.mark.parametrize(("name", "shown"), [("unit", True), ("failed", False)])
 def test_charts_are_explained_where_there_is_one(browser: Browser, pages: Path, name: str, *, shown: bool) -> None:
-    page = browser.new_page()
-    page.goto((pages / f"{name}.html").as_uri())
+    page = opened(browser, pages / f"{name}.html", folded=True)
     assert (page.locator("svg[data-scale]").count() > 0) == shown
     assert page.locator(".chart-hint").is_visible() == shown
-    page.close()
