@@ -94,8 +94,9 @@ def products(q: Array) -> Array:
 
 def multiply(p: Array, q: Array) -> Array:
     """Return the products of quaternions: (n, 4) array."""
-    w = p[:, :1] * q[:, :1] - np.sum(p[:, 1:] * q[:, 1:], axis=1, keepdims=True)
-    return np.hstack([w, p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])])
+    (w, x, y, z), (a, b, c, d) = p.T, q.T
+    vector = [w * b + a * x + (y * d - z * c), w * c + a * y + (z * b - x * d), w * d + a * z + (x * c - y * b)]
+    return np.stack([w * a - (x * b + y * c + z * d), *vector], axis=1)
 
 
 def level_up(q: Array) -> Array:
@@ -192,11 +193,8 @@ def _read(hand: Hand, rng: np.random.Generator, rate: Array, felt: Array, still:
         x += _effects(sensor, hand, felt, time)
         keep = np.exp(-step / sheet.wander_time_s)
         drive = hand.wander[sensor] * np.sqrt(1 - keep**2) * rng.standard_normal((n, 3))
-        wander = np.empty((n, 3))
-        level = hand.wander[sensor] * rng.standard_normal(3)
-        for i in range(n):
-            level = keep * level + drive[i]
-            wander[i] = level
+        level = hand.wander[sensor] * rng.standard_normal((1, 3))
+        wander = scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0, zi=keep * level)[0]
         readings[sensor] = x + wander + hand.white[sensor] * rng.standard_normal((n, 3))
         biases[sensor], matrices[sensor] = bias, np.linalg.inv(K)
     stamps = time
