@@ -81,6 +81,7 @@ class Observations:
     white: float = 0.0  # standard deviation of a sample's white noise, mean of the axes; 0: not known
     steady: float = float("inf")  # s; time over which the bias is constant against white noise
     kept: ReferenceType[Quantities] | None = field(default=None, repr=False)  # results, with the first recording
+    reduced: bool = False  # whether the weights are those of ``weighted``
 
     def once(self, key: Hashable, compute: Callable[[], Result]) -> Result:
         """Return a result that steps and methods of a unit share; ``key``: all that it depends on beside these data.
@@ -181,8 +182,10 @@ def without_each_recording(observations: Observations) -> Iterator[Observations]
 def weighted(observations: Observations, noise: Noise | None) -> Observations:
     """Return observations with weights reduced for correlated noise and for a coarse encoder.
 
-    Errors of the angle are not modelled if they are small against the noise.
+    Errors of the angle are not modelled if they are small against the noise. Reduced weights stay as they are.
     """
+    if observations.reduced:
+        return observations
     key = noise and (noise.source, noise.correlation_time, noise.length, noise.white.tobytes(), noise.wander.tobytes())
     return observations.once((weighted, key), lambda: _weighted(observations, noise))
 
@@ -196,7 +199,7 @@ def _weighted(observations: Observations, noise: Noise | None) -> Observations:
             weight = weight / (1.0 + part.rounding / white**2)
         parts.append(replace(part, weight=weight, scatter=share * part.scatter))
     steady = min((constant_bias_s(noise, part.interval) for part in parts), default=float("inf"))
-    reduced = replace(observations, parts=tuple(parts), white=white, steady=steady)
+    reduced = replace(observations, parts=tuple(parts), white=white, steady=steady, reduced=True)
     lost = [_lost_at_stops(part, reduced).max(initial=0.0) for part in parts]
     return reduced if max(lost, default=0.0) > HIDDEN_ANGLE else replace(reduced, angle_deg=0.0)
 
