@@ -28,13 +28,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Let the search for garbage leave out what is imported: a seventh of the time of the tests of the commands.
-
-    It begins after 50,000 new objects in place of 700: half of the time of a test that parses the package.
-    """
+    """Let the search for garbage leave out what is imported: a seventh of the time of the tests of the commands."""
     gc.disable()
     result = yield
     gc.freeze()
-    gc.set_threshold(50_000)
     gc.enable()
     return result

@@ -38,8 +38,13 @@ class Text(HTMLParser):
             self.links.add(str(own["href"])[1:])
 
 
-def test_the_page_holds_every_table_and_stands_without_a_run(tmp_path: Path) -> None:
-    page = Text(render(CAMPAIGN, tmp_path))
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Text:
+    """The page without a run."""
+    return Text(render(CAMPAIGN, tmp_path_factory.mktemp("no_run")))
+
+
+def test_the_page_holds_every_table_and_stands_without_a_run(page: Text) -> None:
     for number in (*(f"5.{k}" for k in range(1, 27)), "paper 1", "paper 2", "paper 3", "paper 4"):
         assert f"Table {number}\n" in page.text
     assert page.links <= page.ids
@@ -116,6 +121,6 @@ def test_every_explanation_has_a_key_of_its_own_and_is_found() -> None:
         assert key_of(explanations, dict(zip(("table", "block", "row", "column"), place, strict=True))) == key
 
 
-def test_the_page_names_every_conclusion_that_is_judged(tmp_path: Path) -> None:
-    page = Text(render(CAMPAIGN, tmp_path)).text
-    assert page.count(" comparisons\n") + page.count("1 comparison\n") == len(conclusions(ROWS)) == 10
+def test_the_page_names_every_conclusion_that_is_judged(page: Text) -> None:
+    text = page.text
+    assert text.count(" comparisons\n") + text.count("1 comparison\n") == len(conclusions(ROWS)) == 10
