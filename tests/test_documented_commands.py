@@ -189,3 +189,7 @@ def test_what_a_benchmark_or_a_study_imports_from_the_package_exists(script: Pat
             module = import_module(str(node.module))
             for name in node.names:
                 assert hasattr(module, name.name) or import_module(f"{node.module}.{name.name}")
+
+
+def test_the_shipped_demo_has_no_effect_that_a_user_is_to_add() -> None:
+    assert not (ROOT / "data" / "demo" / "devices").exists()
