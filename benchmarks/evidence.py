@@ -163,10 +163,8 @@ def by_holm(figures: Sequence[MeasuredFigure]) -> list[MeasuredFigure]:
     p = {}
     for figure in figures:
         if figure.goal.startswith("contains") and figure.interval:
-            goal, error = (
-                float(figure.goal.split()[1]) / 100.0,
-                np.ptp(figure.interval) / 2.0 / scipy.stats.norm.isf(0.005),
-            )
+            goal = float(figure.goal.split()[1]) / 100.0
+            error = np.ptp(figure.interval) / 2.0 / scipy.stats.norm.isf(0.005)
             p[figure.name] = 2.0 * scipy.stats.norm.sf(abs(figure.value - goal) / error)
     kept = {name for name, value in zip(p, adjusted([*p.values()]), strict=True) if value > 0.01}
     return [figure._replace(goal="") if figure.name in kept else figure for figure in figures]

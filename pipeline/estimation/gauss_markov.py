@@ -57,8 +57,6 @@ LARGEST_SPAN = 1e9  # of variances that a factorisation resolves: 1e7 times the 
 SLOW_SPECTRUM_SHARE = 0.3
 # correlation time below which ``information`` replaces the model, because its blocks last seconds
 MIN_MODELLED_TIME_S = 25.0
-
-
 CACHED = 16384  # numbers of ``GaussMarkov.squares`` that stay in the processor's cache: 128 kB
 
 

@@ -113,7 +113,7 @@ def test_an_effect_of_gravity_that_a_file_cannot_hold_stays_in_its_bias_as_far_a
 
 
 def test_a_file_without_the_slope_of_a_gyroscopes_scale_holds_the_matrix_at_the_recordings_temperature() -> None:
-    slope = np.array([0.002, -0.001, 0.0015])  # 1/degC, some per cent of the rate at 25 degC above or below 25 degC
+    slope = np.array([0.002, -0.001, 0.0015])  # 1/degC
     effects, warm = {"gyroscope.scale_factor_temperature": slope.tolist()}, {"ambient": 40.0}
     description = UnitDescription("U", table="acutronic", effects=effects, temperature=warm)
     recordings, truth = simulate_unit(description, 7, 0)

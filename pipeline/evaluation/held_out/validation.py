@@ -110,7 +110,7 @@ HELD: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 LEAST_SPREAD_G = 0.1  # rms in each direction; in one attitude, effects alone would determine a matrix
 FEWEST_ROWS = 6  # orientations, of which an axis has an offset and three factors
-WARM = {"temperature", "angular_rate"}  # signals of an effect that changes a gyroscope's matrix
+OF_MATRIX = {"temperature", "angular_rate"}  # signals of an effect that changes a gyroscope's matrix
 AT_REST_TOO = {"time", "temperature", "specific_force"}  # signals
 
 
@@ -408,7 +408,7 @@ def reduced(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) ->
         if sum(int(s.known.sum()) for s in fitted) < FEWEST_ROWS:
             return []
         truth = _calibrated(calibration, fitted)
-    warm = _at_mean_temperature(calibration, fitted, truth)
+    sloping, at_mean = _at_mean_temperature(calibration, fitted, truth)
     found: dict[tuple[str, frozenset[str]], Reduced] = {}
     for part, names in HELD:
         kept = frozenset(names) & own
@@ -420,7 +420,7 @@ def reduced(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) ->
             moving = [e for e in calibration.effects if not effect_of(e).fields("gyroscope", e.values) <= AT_REST_TOO]
             partial = replace(calibration, effects=tuple(e for e in calibration.effects if e in effects or e in moving))
         left = truth if partial.effects == calibration.effects else _calibrated(partial, fitted)
-        bias, matrix = _fitted(calibration if kept >= warm[0] else warm[1], part, left, truth)
+        bias, matrix = _fitted(calibration if kept >= sloping else at_mean, part, left, truth)
         partial = replace(partial, effects=effects)
         error = rms_error_of(replace(partial, bias=bias, matrix=matrix), samples)
         found[part, kept] = Reduced(part, sorted(kept), bias.tolist(), matrix.tolist(), error)
@@ -435,8 +435,8 @@ def _calibrated(calibration: SensorCalibration, samples: Sequence[Samples]) -> V
 def _at_mean_temperature(
     calibration: SensorCalibration, fitted: Sequence[Samples], truth: Values
 ) -> tuple[set[str], SensorCalibration]:
-    """Return effects of rate and temperature of a gyroscope, and its calibration with the best matrix without them."""
-    found = {e.name for e in calibration.effects if effect_of(e).fields(calibration.sensor, e.values) == WARM}
+    """Return effects that change a gyroscope's matrix over temperature, and a calibration with the best fixed one."""
+    found = {e.name for e in calibration.effects if effect_of(e).fields(calibration.sensor, e.values) == OF_MATRIX}
     if not found:
         return found, calibration
     others = tuple(e for e in calibration.effects if e.name not in found)
