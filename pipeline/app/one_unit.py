@@ -25,7 +25,7 @@ from imu_logs.units import CANONICAL, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.app.config.campaign import Campaign, UnitRow, cut_batches
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import as_list, key_of
-from pipeline.app.config.options import PYTHON, RUN_SETTINGS, SettingProblem, nearest, parse
+from pipeline.app.config.options import PYTHON, RUN_SETTINGS, nearest, parse
 from pipeline.app.config.stage_settings import as_job_reads, settings_in_memory
 from pipeline.core.errors import (
     ConfigurationError,
@@ -220,9 +220,10 @@ def unit_of_recordings(recordings: Sequence[Recording], layers: Sequence[str]) -
 
 def unit_row(layers: Sequence[str], name: str = "unit", python_effects: Sequence[str] = ()) -> UnitRow:
     """Return a unit without a campaign, as a run composes and checks its configuration from overrides."""
+    composer = Composer(NO_CAMPAIGN, python_effects, below=Path())
     try:
-        config = Composer(NO_CAMPAIGN, python_effects, below=Path()).unit(name, layers)
-    except SettingProblem as problem:
+        config = composer.unit(name, layers)
+    except ConfigurationError as problem:
         raise ConfigurationError(f"the configuration is refused: {problem}") from problem
     return UnitRow(name, {"unit": name}, config, {key: str(value) for key, value in map(parse, layers)})
 

@@ -11,7 +11,6 @@ import yaml
 
 from pipeline.app.config.campaign import load_campaign
 from pipeline.app.config.compose import Composer
-from pipeline.app.config.options import SettingProblem
 from pipeline.app.config.stage_settings import settings_of_jobs
 from pipeline.app.steps.batch import merge_common
 from pipeline.core.errors import ConfigurationError
@@ -73,9 +72,9 @@ def test_the_instance_of_a_topic_is_part_of_its_name(tmp_path: Path) -> None:
 
 
 def test_an_instance_that_nothing_refers_to_and_a_missing_one_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(SettingProblem, match="is set, and no name in the profile canonical_csv contains"):
+    with pytest.raises(ConfigurationError, match="is set, and no name in the profile canonical_csv contains"):
         Composer(tmp_path).unit("U1", ["ingest.instance=1"])
-    with pytest.raises(SettingProblem, match="instance is null; set it"):
+    with pytest.raises(ConfigurationError, match="instance is null; set it"):
         Composer(tmp_path).unit("U1", ["ingest=ardupilot", "ingest.instance=null"])
 
 

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from pipeline.app.config.compose import Composer
-from pipeline.app.config.options import SettingProblem
+from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
 from pipeline.simulation.description import shipped_settings
 
@@ -120,7 +120,7 @@ def test_overrides_keep_their_precedence(compose: Compose) -> None:
     ],
 )
 def test_a_range_that_the_file_does_not_list_is_refused(layers: list[str], says: str, compose: Compose) -> None:
-    with pytest.raises(SettingProblem, match=says):
+    with pytest.raises(ConfigurationError, match=says):
         compose(*layers)
 
 

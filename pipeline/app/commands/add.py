@@ -23,7 +23,7 @@ from pipeline.app.commands.run import run_snakemake
 from pipeline.app.config.campaign import TAKE_OVER, find_campaign, read_layers
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import DEVICES_FOLDER, Layer, Layers, key_of
-from pipeline.app.config.options import SettingProblem, nearest, parse
+from pipeline.app.config.options import nearest, parse
 from pipeline.app.config.owner import require_own_results
 from pipeline.core.errors import ConfigurationError, MissingInputError, PipelineError, shortened
 from pipeline.core.files import write_atomically
@@ -104,7 +104,7 @@ def edit_effects(
         override = f"{key}=[{','.join(wanted)}]"
         try:
             composer.unit(unit, [*(layer.text for layer in of_unit), override])
-        except SettingProblem as problem:
+        except ConfigurationError as problem:
             raise ConfigurationError(f"unit {unit}: {problem}") from None
         if wanted != now:
             text = set_override(text, key, None if wanted == weaker else override, str(file))

@@ -16,7 +16,7 @@ from pipeline.app.commands import parser_of
 from pipeline.app.config.campaign import find_campaign, read_layers
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import Layer
-from pipeline.app.config.options import GROUPS, PYTHON, SettingProblem, default_option, nearest, parse, read_option
+from pipeline.app.config.options import GROUPS, PYTHON, default_option, nearest, parse, read_option
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
 from pipeline.core.settings import REQUIRED_FIGURES, range_settings
@@ -44,7 +44,7 @@ def main(argv: Sequence[str]) -> int:
     layers = all_layers.of(unit)
     try:
         config = composer.unit(unit, [text for _, text in layers])
-    except SettingProblem as problem:
+    except ConfigurationError as problem:
         raise ConfigurationError(f"unit {unit}: {problem}", str(directory / "units.csv")) from None
     print(f"# Unit {unit} of campaign {directory}")
     print("\n".join([*_overrides(layers), *_tree(config.configuration, _origins(composer, layers), composer)]))

@@ -14,7 +14,7 @@ from imu_logs.files import ZIP, is_message_log
 from imu_logs.profile import checks_of
 from pipeline.app.config.campaign import Campaign
 from pipeline.app.config.compose import Composer
-from pipeline.app.config.options import SettingProblem, nearest
+from pipeline.app.config.options import nearest
 from pipeline.checks.checks import check_recordings
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
@@ -131,9 +131,10 @@ def config_of_log(
             directory = Path(folder)
             (directory / "configs" / "ingest").mkdir(parents=True)
             copyfile(path, directory / "configs" / "ingest" / f"{path.stem}.yaml")
+        composer = Composer(directory)
         try:
-            return Composer(directory).unit("check", [*layers, f"ingest={path.stem}"])
-        except SettingProblem as problem:
+            return composer.unit("check", [*layers, f"ingest={path.stem}"])
+        except ConfigurationError as problem:
             raise ConfigurationError(str(problem), profile if directory == Path(folder) else None) from None
 
 

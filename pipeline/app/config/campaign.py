@@ -150,7 +150,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
             texts = [text for _, text in layers.of(name)]
             overrides = {text.partition("=")[0].strip(): text.partition("=")[2].strip() for text in texts}
             units[name] = UnitRow(name, row, composer.unit(name, texts), overrides)
-        except SettingProblem as problem:
+        except ConfigurationError as problem:
             for line in str(problem).splitlines():
                 problems.setdefault(line, []).append(name)
     if problems:
@@ -220,8 +220,6 @@ def run_settings(overrides: Sequence[str]) -> RunSettings:
     try:
         settings |= dict(map(parse, overrides))
         return RunSettings.model_validate(settings)
-    except SettingProblem as problem:
-        raise ConfigurationError(str(problem)) from problem
     except ValidationError as error:
         name = str(error.errors()[0]["loc"][0])
         expected = RunSettings.model_fields[name].description

@@ -100,7 +100,7 @@ class Composer:
     def unit(self, name: str, layers: Sequence[str]) -> Settings:
         """Return the checked settings of a unit from its overrides, weakest first.
 
-        Raises ``SettingProblem`` with one line for each error.
+        Raises ``ConfigurationError`` with one line for each error.
         """
         groups, values = self.split(layers)
         key = repr((sorted(groups.items()), values))
@@ -115,7 +115,7 @@ class Composer:
         return with_given(unit, self.below) if GIVEN in (unit.method.accelerometer, unit.method.gyroscope) else unit
 
     def split(self, layers: Sequence[str]) -> tuple[dict[str, str], list[tuple[str, Any]]]:
-        """Split overrides into the chosen options by group, and the values in order; raises ``SettingProblem``."""
+        """Split overrides into the chosen options by group, and the values in order; raises ``ConfigurationError``."""
         groups: dict[str, str] = {}
         values: list[tuple[str, Any]] = []
         for text in layers:
@@ -137,10 +137,7 @@ class Composer:
             else:
                 values.append((key, value))
         sensor = self._read("sensor", groups.get("sensor") or default_option("sensor"))
-        try:
-            return groups, [setting for key, value in values for setting in range_settings(key, value, sensor)]
-        except ConfigurationError as error:
-            raise SettingProblem(error.message) from None
+        return groups, [setting for key, value in values for setting in range_settings(key, value, sensor)]
 
     def _resolve(self, groups: dict[str, str], values: list[tuple[str, Any]]) -> Settings:
         base, has_references = self._base(self.complete(groups))
@@ -152,10 +149,7 @@ class Composer:
             profile = merged["ingest"]["name"]
             raise SettingProblem(f"ingest.instance is set, and no name in the profile {profile} contains {INSTANCE}")
         if has_references or "${" in repr(values):
-            try:
-                merged = with_references(merged, merged)
-            except ConfigurationError as error:
-                raise SettingProblem(error.message) from error
+            merged = with_references(merged, merged)
         checked: dict[str, Any] = {}
         errors: list[Any] = []
         for section, content in merged.items():
@@ -290,10 +284,7 @@ class Composer:
                     )
         ingest = repr((settings.ingest, settings.procedure))
         if ingest not in self._valid_ingest:
-            try:
-                check_ingest(settings.ingest, settings.procedure)
-            except ConfigurationError as error:
-                raise SettingProblem(error.message) from error
+            check_ingest(settings.ingest, settings.procedure)
             self._valid_ingest.add(ingest)
         for sensor in SENSORS if settings.filter.name in WITHOUT_CONSTANT else ():
             if any(declared(sensor, stage).known for stage in settings.method.stages.of(sensor) or ()):

@@ -40,7 +40,6 @@ from pipeline.app.config.options import (
     ONLY_FROM_THE_COMMAND_LINE,
     PYTHON,
     RUN_SETTINGS,
-    SettingProblem,
     default_option,
     nearest,
     parse,
@@ -325,9 +324,5 @@ def _check_models_and_lots(campaign: CampaignFile, units_table: UnitsTable, sens
             run, _ = _split(overrides)
             if run:
                 raise ConfigurationError(f"{key}, {name}: {run[0]} is a setting of the run, not of units", file)
-            try:
-                chooses_model = key == "models" and any(parse(o)[0] == "sensor" for o in overrides)
-            except SettingProblem as problem:
-                raise ConfigurationError(str(problem)) from problem
-            if chooses_model:
+            if key == "models" and any(parse(o)[0] == "sensor" for o in overrides):
                 raise ConfigurationError(f"models, {name}: the overrides of a model cannot choose another", file)

@@ -50,8 +50,8 @@ ONLY_FROM_THE_COMMAND_LINE = (
 )
 
 
-class SettingProblem(Exception):  # noqa: N818  (problems are collected, then raised as one ConfigurationError)
-    """One error in a configuration."""
+class SettingProblem(ConfigurationError):  # noqa: N818  (problems are collected, then raised as one error)
+    """One error in the configuration of a unit or of a comparison."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
