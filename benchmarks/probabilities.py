@@ -45,7 +45,8 @@ from pipeline.simulation.description import shipped_settings
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-NOT_SIMULATED = ("temperature_lag",)  # needs a chamber
+# Both need a chamber. Without one, the cubic effect is not observable, and its other terms are those of the quadratic.
+NOT_SIMULATED = ("temperature_lag", "bias_temperature_cubic")
 OF_DETECTION = 0.5, 1.5  # times the detection size
 TIME_CONSTANTS_S = 90.0, 400.0  # of a warm-up, as in a study
 

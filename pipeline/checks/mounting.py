@@ -72,7 +72,9 @@ def check_mounting(recordings: Sequence[Recording], settings: Settings) -> list[
     for recording in recordings:
         if recording.role == "rests":
             check_frames_by_hand(recording, maps)
-    departures = {t.name: d for t in turns if (d := _departure(t, tolerance)) is not None}
+    # Two cross-axis sensitivities at their limit lean a turn axis in the sensor's own axes.
+    lean = tolerance + float(np.degrees(np.arctan(np.sqrt(2.0) * sensor.accelerometer.cross_axis)))
+    departures = {t.name: d for t in turns if (d := _departure(t, tolerance, lean)) is not None}
     if not departures:
         doubts = seat_notes(turns, table, sensor)
         conventional = {t.name: _applied(t, doubts.get(t.name), "") for t in turns}
@@ -272,17 +274,17 @@ def words(bench: TurnMounting) -> str:
     )
 
 
-def _departure(turn: TurnRecording, tolerance: float) -> _Departure | None:
+def _departure(turn: TurnRecording, tolerance: float, lean: float) -> _Departure | None:
     """Return the difference between the mounting of a turn and the stated one, or None."""
     if turn.fit.vertical is not None or turn.stated.vertical:
         return _vertical(turn) or _gyroscope_sense(turn)
-    return _axis(turn, tolerance) or (
+    return _axis(turn, tolerance, lean) or (
         _gyroscope_sense(turn) if turn.found is None else _face(turn, turn.found, tolerance)
     )
 
 
-def _axis(turn: TurnRecording, tolerance: float) -> _Departure | None:
-    """Return the difference of the turn axis."""
+def _axis(turn: TurnRecording, tolerance: float, lean: float) -> _Departure | None:
+    """Return the difference of the turn axis; ``lean``: deg, largest by which the readings may show it off an axis."""
     axis, fit, name = turn.stated.axis, turn.fit, turn.name
     direction = fit.turn_axis if fit.turn_axis is not None else fit.gain
     if direction is None:
@@ -296,10 +298,10 @@ def _axis(turn: TurnRecording, tolerance: float) -> _Departure | None:
         renamed = replace(turn.stated, axis=nearest[1], up=usual_up(nearest[1]))
         settings = {} if bench is None else _differing(bench, renamed, tolerance)
         return _Departure(turn, "wrong_axis", problem, {"axis": nearest[1], **settings}, bench)
-    if fit.turn_axis is not None and off > tolerance:
+    if fit.turn_axis is not None and off > lean:
         problem = (
-            f"in {name} gravity turns about an axis that is {off:.1f} deg off body {axis}; {tolerance:g} deg are "
-            "allowed (procedure.mounting_tolerance_deg)"
+            f"in {name} gravity turns about an axis that is {off:.1f} deg off body {axis}; {lean:.3g} deg are allowed "
+            "(procedure.mounting_tolerance_deg and what sensor.accelerometer.cross_axis leans)"
         )
         return _Departure(turn, "wrong_axis", problem, {})
     return None

@@ -24,7 +24,8 @@ from bench_session import (
 )
 from unit_settings import settings_of, with_noise
 
-from pipeline.core.records import Noise, Recording, SensorCalibration
+from pipeline.core.records import Answer, Dependence, Noise, Recording, SensorCalibration, SensorDiagnosis
+from pipeline.core.verdicts import Verdict
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.noise import estimate_noise
@@ -32,6 +33,7 @@ from pipeline.estimation.observability import not_observable
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
 from pipeline.estimation.stages import StageInput
+from pipeline.evaluation.diagnosis.findings import with_unknown
 from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.physics.effects import effect_from, forget, register
 from pipeline.physics.kinematics import table_motion
@@ -276,6 +278,29 @@ def test_a_dependence_that_no_effect_has_is_reported_as_unexplained() -> None:
     assert "angle" in {entry["covariate"] for entry in part["unexplained"]}
     assert part["verdict"] == "unexplained"
     assert part["selected"] == []
+    assert sum(answer["probability"] for answer in part["answer_set"]) >= 0.95
+    assert all(p <= 0.5 for name, p in part["probability"].items() if not name.startswith("other_"))
+
+
+def test_answers_of_an_unexplained_sensor_may_be_imitations() -> None:
+    found = SensorDiagnosis(
+        Verdict.UNEXPLAINED,
+        [],
+        unexplained=[Dependence("temperature", 1e-9)],
+        probability={"warm_up": 0.9, "other_angle": 0.3},
+        answer_set=[Answer(["warm_up"], 0.6), Answer(["other_angle", "warm_up"], 0.3), Answer([], 0.06)],
+    )
+    halved = with_unknown(found)
+    assert {tuple(a.effects): a.probability for a in halved.answer_set} == pytest.approx(
+        {
+            ("warm_up",): 0.3,
+            ("other_temperature",): 0.33,
+            ("other_angle", "warm_up"): 0.15,
+            ("other_angle",): 0.15,
+            (): 0.03,
+        }
+    )
+    assert halved.probability == {"warm_up": 0.45, "other_angle": 0.3}
 
 
 def test_a_table_far_off_its_log_is_unexplained_and_not_mended_with_whatever_fits_a_little() -> None:

@@ -2,7 +2,8 @@
 
 BEFORE and AFTER are results folders of the same campaigns (``results/`` or ``results/<campaign>``). Calibrations,
 validations and diagnoses are compared value by value. Numbers agree within a relative difference of 1e-10; estimates
-also agree within 1e-3 of their standard uncertainty. Text that only describes a result is not compared.
+also agree within 1e-3 of their standard uncertainty. Text that only describes a result is not compared. The last line
+has the smallest and the largest median over the units of the ratio of U, of all parameters of bias and matrix.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 import sys
 from itertools import chain
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 FOLDERS = ("calibrations", "validations", "diagnoses")
@@ -59,6 +61,21 @@ def _short(value: Any) -> str:
     return text if len(text := json.dumps(value)) < 90 else f"{text[:87]}..."
 
 
+def uncertainty_ratios(before: Path, after: Path, files: list[Path]) -> dict[tuple[str, int], list[float]]:
+    """Return U after over U before of each sensor and parameter (bias, then matrix by rows), of all units with both."""
+    ratios: dict[tuple[str, int], list[float]] = {}
+    for file in (f for f in files if f.parent.name == "calibrations" and (after / f).exists()):
+        documents = [json.loads((folder / file).read_bytes()) for folder in (before, after)]
+        for sensor in ("accelerometer", "gyroscope"):
+            stated = [(document.get(sensor) or {}).get("expanded_uncertainty") for document in documents]
+            if all(stated):
+                flat = [[*U["bias"], *chain(*U["matrix"])] for U in stated]
+                for number, (old, new) in enumerate(zip(*flat, strict=True)):
+                    if old and new:
+                        ratios.setdefault((sensor, number), []).append(new / old)
+    return ratios
+
+
 def main(before: Path, after: Path) -> int:
     """Print the differences by file; return 1 where there are any."""
     files = sorted(
@@ -78,6 +95,8 @@ def main(before: Path, after: Path) -> int:
         if len(found) > 8:
             print(f"{file} ... {len(found) - 8} more")
     print(f"{len(files)} files, {different} differ")
+    if medians := [median(each) for each in uncertainty_ratios(before, after, files).values()]:
+        print(f"U after / before, medians of {len(medians)} parameters: {min(medians):.4g} to {max(medians):.4g}")
     return int(different > 0 or not files)
 
 

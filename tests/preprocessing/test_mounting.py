@@ -197,6 +197,22 @@ def _mapped(recording: Recording, accelerometer: Any, gyroscope: Any = None) -> 
     return replace(recording, accelerometer=force @ maps[0].T, gyroscope=rate @ maps[1].T)
 
 
+@pytest.mark.parametrize(
+    ("lean_deg", "cross_axis", "refused"), [(6.0, 0.02, False), (7.5, 0.02, True), (7.5, 0.1, False)]
+)
+def test_a_turn_axis_may_lean_by_the_tolerance_and_what_the_sensor_file_states(
+    lean_deg: float, cross_axis: float, *, refused: bool
+) -> None:
+    turned = Rotation.from_euler("x", lean_deg, degrees=True).as_matrix()
+    recordings = [_mapped(r, turned) for r in recordings_of({})]
+    settings = unit_settings.settings_of(settings_of(recordings), sensor={"accelerometer": {"cross_axis": cross_axis}})
+    if refused:  # 5 deg, and 1.6 deg of two cross-axis sensitivities of 2 %
+        with pytest.raises(IngestError, match=r"deg off body y; 6.62 deg are allowed"):
+            check_mounting(recordings, settings)
+    else:
+        check_mounting(recordings, settings)
+
+
 STRAIGHT, MIRROR_Z, REFLECTION = np.eye(3), np.diag([1.0, 1.0, -1.0]), -np.eye(3)
 
 

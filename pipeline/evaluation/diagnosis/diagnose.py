@@ -57,7 +57,7 @@ from pipeline.estimation.noise import with_noises
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.stages import last_fit
 from pipeline.evaluation.diagnosis import multi_position, turntable
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, diagnosis_of
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, diagnosis_of, with_unknown
 from pipeline.evaluation.diagnosis.verdict import (
     EXPLAINED,
     MAX_UNKNOWN_PROBABILITY,
@@ -215,6 +215,7 @@ def diagnose(
         evidence = replace(evidence, doubts=doubts, moves=moves, scatter=_scatter(calibration))
         found = judged(found, evidence)
         found = without_impossible(without_harmful(found, findings.harmful if findings else {}), case)
+        found = with_unknown(found) if found.verdict == Verdict.UNEXPLAINED else found
         return found, full or may_be_unknown(found.verdict, evidence)
 
     try:
