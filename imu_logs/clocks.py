@@ -32,23 +32,17 @@ names the setting ``rate_hz``, by which the user states that no row is missing. 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imu_logs.errors import IngestError
-from imu_logs.log import Note
+from imu_logs.log import Index, Integers, Log, Mask, Note, Values
 from imu_logs.units import SECOND_NS, SINCE_1970_NS, TRIADS, UNITS
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from imu_logs.log import Index, Integers, Log, Mask, Values
-
 
 MAX_NANOSECONDS = np.iinfo(np.int64).max
 

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from imu_logs.errors import IngestError
 from imu_logs.files import BINARY, is_binary
+from imu_logs.log import Values
 from imu_logs.profile import COMMENTED, DROP, GAP
 from imu_logs.units import (
     BRACKETS,
@@ -28,12 +30,7 @@ from imu_logs.units import (
     unit_spelt,
 )
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from imu_logs.log import Values
-
-    Triad = tuple[int, int, int]
+Triad = tuple[int, int, int]
 
 COUNTING = 0.98  # share of steps by exactly 1
 FEW = 0.01  # share of rows at which it falls: between sessions

@@ -6,19 +6,15 @@ specific force : the median of |f| is near 1 in g, 9.8 in m/s^2, 1000 in mg
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from imu_logs.columns import LOW_COST_ERROR, SINCE_1970_S, whole
+from imu_logs.columns import LOW_COST_ERROR, SINCE_1970_S, Columns, whole
+from imu_logs.log import Values
 from imu_logs.units import COUNTS, FORCE_UNITS, UNITS
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from imu_logs.columns import Columns
-    from imu_logs.log import Values
 
 TO_DECIDE = "???"
 OF_SENSOR = "${{sensor.{}.counts_per_unit}}"  # in a profile: a reference to the configuration of the sensor

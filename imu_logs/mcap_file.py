@@ -29,27 +29,21 @@ import os
 import struct
 import zlib
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from io import BytesIO
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
+import mcap.records as mcap
 import numpy as np
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Metadata, Schema, Statistics
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from imu_logs.errors import IngestError
 from imu_logs.files import FOREIGN
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from mcap.records import McapRecord
-    from numpy.typing import NDArray
-
-    from imu_logs.log import Index, Integers, Note
-
+from imu_logs.log import Index, Integers, Note
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = 9  # bytes of opcode and length
@@ -65,7 +59,7 @@ HEAD = np.dtype({
     "itemsize": RECORD_HEAD + MESSAGE_HEAD,
 })  # fmt: skip
 _RECORD, _HEAD = struct.Struct("<BQ"), struct.Struct("<BQH")
-DEFINITIONS = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
+DEFINITIONS = {Opcode.SCHEMA: mcap.Schema, Opcode.CHANNEL: mcap.Channel}
 ONLY_IN_DATA = frozenset({
     Opcode.HEADER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA,
     Opcode.DATA_END,
@@ -255,14 +249,14 @@ def parsed(kind: Any, content: bytes | memoryview) -> Any:  # noqa: ANN401  (a c
     Raises ``ValueError`` if it is too short, a text is not UTF-8, or its lengths contradict each other.
     """
     record = kind.read(_Content(BytesIO(content)))
-    if kind is not Chunk and not bytes(content).startswith(bytes_of([record])[RECORD_HEAD:]):
+    if kind is not mcap.Chunk and not bytes(content).startswith(bytes_of([record])[RECORD_HEAD:]):
         raise ValueError(f"the lengths within a {kind.__name__} record contradict each other")
     return record
 
 
-def attachment(content: bytes) -> Attachment:
+def attachment(content: bytes) -> mcap.Attachment:
     """Parse an attachment; raise ``ValueError`` if its checksum is neither right nor 0 (not computed)."""
-    record: Attachment = Attachment.read(_Content(BytesIO(content)))
+    record: mcap.Attachment = mcap.Attachment.read(_Content(BytesIO(content)))
     written = bytes_of([record])[RECORD_HEAD:]  # with the right checksum, in its last four bytes
     body, crc = content[: len(written) - 4], content[len(written) - 4 : len(written)]
     if body != written[:-4] or crc not in {bytes(4), written[-4:]}:
@@ -270,7 +264,7 @@ def attachment(content: bytes) -> Attachment:
     return record
 
 
-def bytes_of(records: Iterable[McapRecord]) -> bytes:
+def bytes_of(records: Iterable[mcap.McapRecord]) -> bytes:
     """Return the bytes of records in a file."""
     builder = RecordBuilder()
     for record in records:
@@ -307,8 +301,8 @@ class MessageReader:
 
     def __init__(self, path: str) -> None:
         self.path = path
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
+        self.schemas: dict[int, mcap.Schema] = {}
+        self.channels: dict[int, mcap.Channel] = {}
         self.counts: Counter[int] = Counter()
         self.notes: list[Note] = []
         self.has_recorder = True
@@ -338,12 +332,12 @@ class McapReader(MessageReader):
         check_magic(stream.read(64), path)
         self.size = stream.seek(0, os.SEEK_END)
         stream.seek(0)
-        self.header: Header | None = None
-        self.attachments: list[Attachment] = []
-        self.metadata: list[Metadata] = []
+        self.header: mcap.Header | None = None
+        self.attachments: list[mcap.Attachment] = []
+        self.metadata: list[mcap.Metadata] = []
         self.chunks: list[int] = []  # byte at which each begins
         self.position = 0  # bytes read so far
-        self._statistics: Statistics | None = None
+        self._statistics: mcap.Statistics | None = None
         self._chunk_index: list[int] = []  # bytes at which chunks begin, by the summary
         self._crc, self._sha = 0, hashlib.sha256()
         self._start = 0  # byte at which the current record begins
@@ -427,7 +421,7 @@ class McapReader(MessageReader):
             if opcode == Opcode.DATA_END:
                 if self._run.records:
                     yield self._run
-                return self._end_data(parsed(DataEnd, content).data_section_crc, crc)
+                return self._end_data(parsed(mcap.DataEnd, content).data_section_crc, crc)
             self._store_record(opcode, content)
             self._run.records.append((head, content))
 
@@ -437,9 +431,9 @@ class McapReader(MessageReader):
             message = f"no Header record: the first is of kind {opcode}" if not self.header else "a second Header"
             raise ValueError(message)
         if opcode == Opcode.HEADER:
-            self.header = parsed(Header, content)
+            self.header = parsed(mcap.Header, content)
         elif opcode == Opcode.CHUNK:
-            self._unpack(parsed(Chunk, content))
+            self._unpack(parsed(mcap.Chunk, content))
         elif opcode == Opcode.MESSAGE_INDEX:
             channel, offsets = message_index(content)
             self._run.index[channel] = offsets
@@ -449,13 +443,13 @@ class McapReader(MessageReader):
         elif opcode == Opcode.ATTACHMENT:
             self.attachments.append(attachment(content))
         elif opcode == Opcode.METADATA:
-            self.metadata.append(parsed(Metadata, content))
+            self.metadata.append(parsed(mcap.Metadata, content))
         elif opcode in ONLY_IN_SUMMARY:
             raise ValueError(f"a record of kind {opcode} of the summary stands in the data")
         else:
             self._unknown_kinds = True
 
-    def _unpack(self, chunk: Chunk) -> None:
+    def _unpack(self, chunk: mcap.Chunk) -> None:
         run = self._run
         run.offset, run.name = self._start, f"chunk {len(self.chunks) + 1}"
         run.data = unpack(chunk.data, chunk.uncompressed_size, chunk.compression)
@@ -510,12 +504,12 @@ class McapReader(MessageReader):
             if opcode in DEFINITIONS:
                 self._define(opcode, content)
             elif opcode == Opcode.STATISTICS:
-                self._statistics = parsed(Statistics, content)
+                self._statistics = parsed(mcap.Statistics, content)
             elif opcode == Opcode.CHUNK_INDEX:
-                self._chunk_index.append(parsed(ChunkIndex, content).chunk_start_offset)
-        self._check_footer(parsed(Footer, content), zlib.crc32(head + content[:16], crc), start)
+                self._chunk_index.append(parsed(mcap.ChunkIndex, content).chunk_start_offset)
+        self._check_footer(parsed(mcap.Footer, content), zlib.crc32(head + content[:16], crc), start)
 
-    def _check_footer(self, footer: Footer, crc: int, start: int) -> None:
+    def _check_footer(self, footer: mcap.Footer, crc: int, start: int) -> None:
         """Check the checksum and the place of the summary, and the last bytes of the file."""
         if footer.summary_crc not in {0, crc}:
             raise ValueError("the checksum of the summary is wrong")

@@ -18,104 +18,49 @@ import os
 import struct
 import zlib
 from collections import Counter
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
 
+import mcap.records as mcap
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Metadata,
-    MetadataIndex,
-    Statistics,
-    SummaryOffset,
-)
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
+from numpy.typing import NDArray
 
 from imu_logs.errors import InputError
-from imu_logs.mcap_file import HEAD, MAGIC, MESSAGE_HEAD, RECORD_HEAD, attachment, bytes_of, parsed
-from imu_logs.message_layout import LITTLE_ENDIAN
+from imu_logs.log import Index, Integers, Log, Values
+from imu_logs.mcap_file import (
+    HEAD,
+    MAGIC,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    ChannelMessages,
+    Run,
+    attachment,
+    bytes_of,
+    parsed,
+)
+from imu_logs.message_layout import LITTLE_ENDIAN, MessageLayout
 from imu_logs.units import ATTITUDE, SECOND_NS, STANDARD_GRAVITY, TRIADS
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
+Readings = Mapping[str, Values]  # sensor to (n, 3) readings, or to the (3, 3) covariance of a sample
 
-    from numpy.typing import NDArray
-
-    from imu_logs.log import Index, Integers, Log, Values
-    from imu_logs.mcap_file import ChannelMessages
-    from imu_logs.message_layout import MessageLayout
-
-    Readings = Mapping[str, Values]  # sensor to (n, 3) readings, or to the (3, 3) covariance of a sample
-    from collections.abc import Iterable
-
-    from mcap.records import Channel, McapRecord, Schema
-
-    from imu_logs.mcap_file import Run
-
-
+MESSAGES = Path(__file__).parent / "messages"
 IMU = "sensor_msgs/msg/Imu"
 TEMPERATURE = "sensor_msgs/msg/Temperature"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 QUATERNION_STAMPED = "geometry_msgs/msg/QuaternionStamped"
 
-_RULE = "=" * 80
-_HEADER = f"""{_RULE}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{_RULE}
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-_QUATERNION = f"""{_RULE}
-MSG: geometry_msgs/Quaternion
-float64 x 0
-float64 y 0
-float64 z 0
-float64 w 1
-"""
-_VECTOR = f"""{_RULE}
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-"""
-DEFINITIONS = {
-    IMU: f"""std_msgs/Header header
-geometry_msgs/Quaternion orientation
-float64[9] orientation_covariance
-geometry_msgs/Vector3 angular_velocity
-float64[9] angular_velocity_covariance
-geometry_msgs/Vector3 linear_acceleration
-float64[9] linear_acceleration_covariance
-{_HEADER}{_QUATERNION}{_VECTOR}""",
-    TEMPERATURE: f"""std_msgs/Header header
-float64 temperature
-float64 variance
-{_HEADER}""",
-    JOINT_STATE: f"""std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-{_HEADER}""",
-    QUATERNION_STAMPED: f"""std_msgs/Header header
-geometry_msgs/Quaternion quaternion
-{_HEADER}{_QUATERNION}""",
-}
 TOPICS = {
     IMU: "/imu/data",
     TEMPERATURE: "/imu/temperature",
     JOINT_STATE: "/table/joint_states",
     QUATERNION_STAMPED: "/table/attitude",
 }
+# Of each type, with those of the types in it.
+DEFINITIONS = {kind: (MESSAGES / f"{kind.rpartition('/')[2]}.msg").read_text("ascii") for kind in TOPICS}
 JOINT = "table"
 # Vector of an Imu message: sensor, its unit, and one g or deg/s in that unit.
 VECTORS = {
@@ -301,9 +246,9 @@ class McapCopy:
         self.compression = ""  # of the last chunk
         self.counts: Counter[int] = Counter()
         self.times: list[int] = []  # the first and the last
-        self.chunks: list[ChunkIndex] = []
-        self.attachments: list[AttachmentIndex] = []
-        self.metadata: list[MetadataIndex] = []
+        self.chunks: list[mcap.ChunkIndex] = []
+        self.attachments: list[mcap.AttachmentIndex] = []
+        self.metadata: list[mcap.MetadataIndex] = []
         self._write(MAGIC)
 
     def _write(self, *parts: bytes) -> None:
@@ -325,10 +270,10 @@ class McapCopy:
         """Write a record of the data section, and store its place for the summary."""
         opcode, place = head[0], {"offset": self.position, "length": len(head) + len(content)}
         if opcode == Opcode.CHUNK:
-            chunk = parsed(Chunk, content)
+            chunk = parsed(mcap.Chunk, content)
             self.compression = chunk.compression
             self.chunks.append(
-                ChunkIndex(
+                mcap.ChunkIndex(
                     chunk_start_offset=place["offset"], chunk_length=place["length"], compression=chunk.compression,
                     compressed_size=len(chunk.data), uncompressed_size=chunk.uncompressed_size,
                     message_start_time=chunk.message_start_time, message_end_time=chunk.message_end_time,
@@ -342,20 +287,20 @@ class McapCopy:
         elif opcode == Opcode.ATTACHMENT:
             a = attachment(content)
             self.attachments.append(
-                AttachmentIndex(
+                mcap.AttachmentIndex(
                     **place, create_time=a.create_time, log_time=a.log_time, data_size=len(a.data), name=a.name,
                     media_type=a.media_type,
                 ),
             )  # fmt: skip
         elif opcode == Opcode.METADATA:
-            self.metadata.append(MetadataIndex(**place, name=parsed(Metadata, content).name))
+            self.metadata.append(mcap.MetadataIndex(**place, name=parsed(mcap.Metadata, content).name))
         self._write(head, content)
 
     def _count(self, channel: int, times: NDArray[np.uint64]) -> None:
         self.counts[channel] += len(times)
         self.times = [min([*self.times, int(times.min())]), max([*self.times, int(times.max())])]
 
-    def add(self, table: NDArray[np.uint8] | list[bytes], before: Iterable[McapRecord], channel: int) -> None:
+    def add(self, table: NDArray[np.uint8] | list[bytes], before: Iterable[mcap.McapRecord], channel: int) -> None:
         """Add messages of one channel, as rows of bytes or a list of records, after the definitions ``before``."""
         head = bytes_of(before)
         if isinstance(table, np.ndarray):
@@ -372,7 +317,7 @@ class McapCopy:
     def _chunk(self, data: bytes | memoryview, entries: dict[int, tuple[NDArray[np.uint64], Integers]]) -> None:
         """Write a chunk and the indexes of its channels: times and offsets of their messages."""
         times = np.concatenate([t for t, _ in entries.values()])
-        chunk = Chunk(
+        chunk = mcap.Chunk(
             compression=self.compression, data=_compressed(data, self.compression), uncompressed_size=len(data),
             uncompressed_crc=zlib.crc32(data), message_start_time=int(times.min()), message_end_time=int(times.max()),
         )  # fmt: skip
@@ -382,17 +327,17 @@ class McapCopy:
             content = struct.pack("<HI", channel, len(table)) + table
             self._record(struct.pack("<BQ", Opcode.MESSAGE_INDEX, len(content)), content)
 
-    def add_record(self, record: McapRecord) -> None:
+    def add_record(self, record: mcap.McapRecord) -> None:
         """Add a record of the data section."""
         written = bytes_of([record])
         self._record(written[:RECORD_HEAD], written[RECORD_HEAD:])
 
-    def finish(self, schemas: Sequence[Schema], channels: Sequence[Channel]) -> None:
+    def finish(self, schemas: Sequence[mcap.Schema], channels: Sequence[mcap.Channel]) -> None:
         """Close the data section and write the summary."""
-        self._write(bytes_of([DataEnd(data_section_crc=self.crc)]))
+        self._write(bytes_of([mcap.DataEnd(data_section_crc=self.crc)]))
         start = self.position
         times = self.times or [0, 0]
-        statistics = Statistics(
+        statistics = mcap.Statistics(
             attachment_count=len(self.attachments), channel_count=len(channels), schema_count=len(schemas),
             channel_message_counts=dict(self.counts), chunk_count=len(self.chunks), metadata_count=len(self.metadata),
             message_count=self.counts.total(), message_start_time=times[0], message_end_time=times[1],
@@ -400,9 +345,9 @@ class McapCopy:
         groups = [schemas, channels, [statistics], self.chunks, self.attachments, self.metadata]
         summary, offsets = b"", []
         for data in (bytes_of(group) for group in groups if group):
-            offsets.append(SummaryOffset(data[0], start + len(summary), len(data)))
+            offsets.append(mcap.SummaryOffset(data[0], start + len(summary), len(data)))
             summary += data
-        footer = Footer(summary_start=start, summary_offset_start=start + len(summary), summary_crc=0)
+        footer = mcap.Footer(summary_start=start, summary_offset_start=start + len(summary), summary_crc=0)
         summary += bytes_of(offsets)
         footer.summary_crc = zlib.crc32(bytes_of([footer])[:-4], zlib.crc32(summary))
         self._write(summary, bytes_of([footer]), MAGIC)

@@ -24,28 +24,22 @@ import hashlib
 import io
 import json
 import re
+from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.records import Channel, Schema
+from numpy.typing import NDArray
 
 from imu_logs.errors import IngestError
-from imu_logs.files import BINARY, MESSAGE_FORMATS, PRINTABLE, is_mat_5, kind_of
-from imu_logs.log import Note
+from imu_logs.files import BINARY, MESSAGE_FORMATS, PRINTABLE, MessageFormat, is_mat_5, kind_of
+from imu_logs.log import Integers, Note
 from imu_logs.mcap_file import COPY_AGAIN, HEAD, ChannelMessages, McapReader, MessageReader
 from imu_logs.message_decoder import ARRAYS, STATED
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from imu_logs.files import MessageFormat
-    from imu_logs.log import Integers
-
-    Columns = Mapping[str, NDArray[Any]]
+Columns = Mapping[str, NDArray[Any]]
 
 MESSAGES_OF_A_RUN = 4096  # messages of one topic of a bag that are decoded together
 ELEMENT = re.compile(r"(.+)\[(\d+)\]")

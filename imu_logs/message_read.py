@@ -9,35 +9,28 @@ joined row by row.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imu_logs.clocks import averaged, check_fine, check_plausible, counted, find_bursts, in_order, rows_covered
 from imu_logs.columns import MAX_PARSED_ROWS, MIN_ROWS, UnknownLog, find_columns
 from imu_logs.errors import IngestError
 from imu_logs.files import unchanged
-from imu_logs.log import Log, Note, joined
+from imu_logs.log import Integers, Log, Note, joined
+from imu_logs.mcap_file import ChannelMessages, MessageReader
 from imu_logs.mcap_write import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
 from imu_logs.message_decoder import MAPPED, STATED, TopicDecoder, Topics, listed_topics, ros_layouts, topic_of
 from imu_logs.message_layout import STAMPS
 from imu_logs.message_logs import open_reader
-from imu_logs.profile import HEADER, OWN, mcap_format, mcap_formats
+from imu_logs.profile import HEADER, OWN, McapFormat, Profile, mcap_format, mcap_formats
 from imu_logs.units import ACCELEROMETER, COUNTS, GYROSCOPE, TABLE_CHANNELS, TRIADS
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from imu_logs.log import Integers
-    from imu_logs.mcap_file import ChannelMessages, MessageReader
-    from imu_logs.profile import McapFormat, Profile
-
-    Columns = dict[str, NDArray[Any]]
-
+Columns = dict[str, NDArray[Any]]
 
 LONGEST_ARRAY = 16  # elements of a field that may be readings
 OF_ARRAYS = ("HDF5", "MATLAB", "NumPy", "TDMS")  # formats whose arrays a user names

@@ -20,34 +20,26 @@ logger.
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, BinaryIO
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from imu_logs.clocks import bursts_error, counted, sorted_once, with_regular_clock
 from imu_logs.errors import IngestError
 from imu_logs.files import archive_of, member, unchanged
-from imu_logs.log import REPAIRED, Log, Note, in_house_unit, joined
+from imu_logs.log import REPAIRED, Index, Integers, Log, Note, Values, in_house_unit, joined
 from imu_logs.profile import AUTO, DROP, GAP, Checks, Column, CsvFormat
 from imu_logs.text_layout import PARTS, Fault, TextLayout, column_notes, find_columns, find_faults, gcsv_format, refusal
 from imu_logs.text_lines import TextLog
 from imu_logs.units import COUNTS, TRIADS, UNITS
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from fractions import Fraction
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from imu_logs.log import Index, Integers, Values
-    from imu_logs.profile import Column
-
 
 LINES_BELOW, SEARCHED_BELOW = 60, 10_000  # lines, bytes after a header without the columns, searched for another
 LINES, EXACT = -1, -2  # instead of a column's index: numbers of the lines, times in ns

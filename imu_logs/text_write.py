@@ -14,24 +14,23 @@ from __future__ import annotations
 import csv
 import io
 import os
+from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from pyarrow import csv as arrow_csv
 
 from imu_logs.errors import ConfigurationError, IngestError
+from imu_logs.log import Integers, Log, Values
 from imu_logs.units import CANONICAL
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
     import pandas as pd
-    from numpy.typing import NDArray
 
-    from imu_logs.log import Integers, Log, Values
 
 IN_SECONDS = "time_s is a number of seconds: (times - times.iloc[0]).dt.total_seconds()"
 

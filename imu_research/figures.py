@@ -6,19 +6,18 @@ Every command that measures evidence (``benchmarks/evidence.yaml``) writes its f
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 import scipy
 
+from pipeline.core.files import JSON
+from pipeline.core.records import Values
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
     import pandas as pd
-
-    from pipeline.core.files import JSON
-    from pipeline.core.records import Values
 
 
 class MeasuredFigure(NamedTuple):

@@ -29,10 +29,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from imu_logs.yaml_file import read_yaml
 from pipeline.core.files import CONFIGS
 from pipeline.core.records import SENSORS, Values
 from pipeline.core.settings import DataSheet
@@ -67,94 +69,17 @@ ALTERNATIVES = [  # not hidden together: their signals are nearly alike
 FACTOR = {"small": 0.3, "tiny": 0.1, "lag": 0.3}  # of the sensor file's size
 WANDER = {"white": 0.0, "normal": 1.0, "wander": 5.0, "random_walk": 0.0, "one_over_f": 0.0}  # of the sensor file's
 STIM_SHARE = 0.25  # of the units of the families that have both models
-METHODS = REFERENCE, STAGED, METHODS_OF_HAND_HELD_CASES = (
-    "reference_least_squares",
-    "staged",
-    "rests_and_moves",
-)  # that fit a base
+# that fit a base
+METHODS = REFERENCE, STAGED, METHODS_OF_HAND_HELD_CASES = "reference_least_squares", "staged", "rests_and_moves"
 INTERVAL_S, INTERVAL_BY_HAND_S = 0.12, 0.01  # of a sample: the default of a simulation; by hand, moves are faster
-TABLE_SHARES = {
-    "acutronic": 0.5,
-    "mark2": 0.45,
-    "single_axis": 0.05,
-}  # and their shares; the last takes 20 times as long
+# tables of null_sensors and their shares; the last takes 20 times as long
+TABLE_SHARES = {"acutronic": 0.5, "mark2": 0.45, "single_axis": 0.05}
 RESTS_BY_HAND = 15, 40  # by hand; from 15 on, some are held out of a fit
 CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
 LAG_S = 10.0, 60.0  # of a thermometer, by assumption: packages of grams
-TABLE = {  # deg; ripple relative: a table of hobby parts, by assumption
-    "table_tilt": 0.2,
-    "table_axis_nonorthogonality": 0.1,
-    "table_encoder_error": 0.1,
-    "table_rate_ripple": 5e-3,
-    "table_backlash": 0.1,
-}
-SIZES: dict[str, dict[str, dict[str, float | tuple[float, ...]]]] = {
-    "mpu6050": {
-        "accelerometer": {
-            "bias_temperature": 5e-4,
-            "bias_temperature_quadratic": (5e-4, 3e-5) * 3,
-            "warm_up": (5e-3, 5e-3, 5e-3, 180.0),
-            "bias_drift": 3e-6,
-            "scale_factor_temperature": 2e-4,
-            "scale_factor_asymmetry": 3e-3,
-            "quadratic_nonlinearity": 5e-3,
-            "cubic_nonlinearity": 5e-3,
-            "cross_axis_nonlinearity": 3e-3,
-            "vibration_rectification": 2e-3 / 30.0,
-            "hysteresis": 1e-3,
-            "rate_dependence": 5e-5,
-            "lever_arm": 0.05,
-            "inner_lever_arms": 3e-3,
-            "time_offset": 0.02,
-            "low_pass_lag": (0.019,),
-            "clock_rate": 200.0,
-            **TABLE,
-        },
-        "gyroscope": {
-            "bias_temperature": 0.16,
-            "bias_temperature_quadratic": (0.16, 5e-3) * 3,
-            "warm_up": (0.3, 0.3, 0.3, 180.0),
-            "bias_drift": 2e-4,
-            "scale_factor_temperature": 3e-4,
-            "scale_factor_asymmetry": 2e-3,
-            "quadratic_nonlinearity": 1.6e-5,
-            "cubic_nonlinearity": 1.3e-7,
-            "vibration_rectification": 0.05 / 100.0,
-            "g_sensitivity": 0.1,
-            "g_squared_sensitivity": 0.02,
-            "earth_rotation": 0.0042,
-            "time_offset": 0.02,
-            "low_pass_lag": (0.019,),
-            "clock_rate": 200.0,
-            **TABLE,
-        },
-    },
-    "stim300": {
-        "accelerometer": {
-            "bias_temperature": 4e-5,
-            "warm_up": (1e-3, 1e-3, 1e-3, 180.0),
-            "scale_factor_asymmetry": 1e-4,
-            "quadratic_nonlinearity": 1e-4,
-            "cubic_nonlinearity": 1e-4,
-            "cross_axis_nonlinearity": 1e-4,
-            "lever_arm": 0.05,
-            "inner_lever_arms": 0.012,
-            "time_offset": 2e-3,
-            "table_tilt": 0.02,
-            "table_axis_nonorthogonality": 0.01,
-            "table_encoder_error": 0.01,
-        },
-        "gyroscope": {
-            "bias_temperature": 2.0 / 3600.0,
-            "warm_up": (5e-3, 5e-3, 5e-3, 180.0),
-            "scale_factor_asymmetry": 1e-4,
-            "g_sensitivity": 8.0 / 3600.0,
-            "earth_rotation": 0.0042,
-            "time_offset": 2e-3,
-            "table_rate_ripple": 5e-4,
-        },
-    },
-}
+_OF_FILE = read_yaml(Path(__file__).with_name("sizes.yaml"))
+SIZES: dict[str, dict[str, dict[str, float | list[float]]]] = _OF_FILE["sizes"]  # by model and sensor
+FAINT: dict[str, dict[str, list[str]]] = _OF_FILE["faint"]  # effects that hide in the noise
 # Effects that a procedure does not show, or shows by less than a detection needs (theory: the page of the effect).
 UNSEEN_GYROSCOPE = ("table_tilt", "table_backlash", "table_axis_nonorthogonality")
 SAME_GYROSCOPE = ("table_encoder_error",)  # in a gyroscope its derivative equals a ripple of the rate
@@ -162,20 +87,9 @@ ONE_WAY = {
     "accelerometer": {"vibration_rectification", "rate_dependence", "table_backlash"},
     "gyroscope": {"scale_factor_asymmetry", "vibration_rectification"},
 }
-# Their lambda (``imu_research.study.bench``) is below 150; a detection takes 40 to 100.
-FAINT = {
-    "mpu6050": {"accelerometer": {"scale_factor_temperature"}, "gyroscope": {"scale_factor_temperature"}},
-    "stim300": {
-        "accelerometer": {"bias_temperature", "quadratic_nonlinearity", "cubic_nonlinearity"},
-        "gyroscope": {"bias_temperature"},
-    },
-}
 OF_SENSOR_BY_HAND = {  # effects of the sensor that rests in many attitudes, or moves between them, can show
     "accelerometer": (
-        "scale_factor_asymmetry",
-        "quadratic_nonlinearity",
-        "cubic_nonlinearity",
-        "cross_axis_nonlinearity",
+        *("scale_factor_asymmetry", "quadratic_nonlinearity", "cubic_nonlinearity", "cross_axis_nonlinearity"),
     ),
     "gyroscope": ("scale_factor_asymmetry", "g_sensitivity", "g_squared_sensitivity"),
 }

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from imu_research.figures import wilson
+from imu_research.figures import MeasuredFigure, wilson
 from imu_research.study.cases import FAINT, SIZES
 from imu_research.study.scores import (
     GATES,
@@ -28,10 +29,8 @@ from pipeline.output.pages.pages import template
 from pipeline.physics.effects import effect
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from imu_research.figures import MeasuredFigure
     from imu_research.study.result import ScoredCase
+
 
 TableRows = list[list[Any]]
 LISTED = 40  # cases on the page that miss a goal
@@ -164,7 +163,7 @@ def _sensor_file_sizes() -> TableRows:
     for model, sensors in SIZES.items():
         for sensor, sizes in sensors.items():
             for name, size in sizes.items():
-                values = size if isinstance(size, tuple) else (size,)
+                values = size if isinstance(size, list) else (size,)
                 text = ", ".join(dict.fromkeys(f"{value:.3g}" for value in values))
                 units = ", ".join(dict.fromkeys(p.unit for p in effect(name).parameters(sensor)))
                 faint = " (hides in the noise)" if name in FAINT[model][sensor] else ""

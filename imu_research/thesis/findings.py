@@ -28,7 +28,9 @@ effect of vibration on the precise table.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -48,18 +50,12 @@ from imu_research.thesis.tables import (
     read_printed,
     values,
 )
+from pipeline.core.files import JSON
+from pipeline.core.records import Values
 from pipeline.output.pages.comparison import MeanWithUncertainty, mean_of
 from pipeline.physics.effects.base import STANDARD_GRAVITY
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
-
-    from pipeline.core.files import JSON
-    from pipeline.core.records import Values
-
-    Place = tuple[str, str]  # set of recordings and method
-
+Place = tuple[str, str]  # set of recordings and method
 
 CONFIRMED, REFUTED, NO_DIFFERENCE, NOT_DECIDED = "confirmed", "refuted", "no difference", "not decided"
 CSS_CLASSES = {CONFIRMED: "good", REFUTED: "bad", NO_DIFFERENCE: "warn", NOT_DECIDED: "warn"}  # CSS classes

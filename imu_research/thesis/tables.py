@@ -9,28 +9,25 @@ printed value and its rounding.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.integrate import cumulative_trapezoid
 
 from pipeline.app.steps.unit_files import recordings_of
+from pipeline.core.files import JSON
 from pipeline.core.pack import Pack, read_published
 from pipeline.core.records import Noise, Recording, Values
 from pipeline.evaluation.held_out.samples import samples_of_motion
 from pipeline.physics.signal.rests import find_rests
 from pipeline.simulation.description import shipped_settings
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-    from pathlib import Path
-
-    from pipeline.core.files import JSON
-
-    Cells = Iterator[tuple[Any, ...]]
+Cells = Iterator[tuple[Any, ...]]
 
 AXES = "xyz"
 DEVICES = {"mpu6050-1": "MPU6050 (1)", "mpu6050-2": "MPU6050 (2)", "stim300": "STIM300"}

@@ -13,21 +13,18 @@ from __future__ import annotations
 import ast
 import re
 import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError
+from pipeline.core.records import Values
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from pipeline.core.records import Values
-
-    Signals = Mapping[str, Values]
-    Evaluate = Callable[[Signals], Any]
+Signals = Mapping[str, Values]
+Evaluate = Callable[[Signals], Any]
 
 # above every shipped formula; they bound the cost
 MAX_FORMULA_LENGTH, MAX_FORMULA_DEPTH, MAX_FORMULA_NODES, LARGEST_POWER = 500, 40, 200, 20.0

@@ -27,11 +27,14 @@ one of them held out, and soaks in a thermal chamber, each in another attitude.
 
 from __future__ import annotations
 
+import argparse
 import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, fields, replace
 from functools import cache
 from itertools import pairwise, product
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
@@ -60,12 +63,6 @@ from pipeline.simulation.trajectory import (
     turn,
     turn_with_plateau,
 )
-
-if TYPE_CHECKING:
-    import argparse
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
-
 
 ONE_RECORDING, FERRARIS = "one_recording", "ferraris"
 AGAIN = 0.1  # of a face's tilt: difference between two rests on the same face

@@ -34,22 +34,17 @@ sections 3.3 and 5.2.3) has all of them: acrylic parts, stepper motors, friction
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy
 
-from pipeline.core.records import attitude_matrix
+from pipeline.core.records import Index, Values, attitude_matrix
 from pipeline.core.settings import ProgramRest, ProgramTurn
+from pipeline.ingest.commanded_motion import Program
 from pipeline.physics.kinematics import level_at_zero, turn_by_vector
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.core.records import Index, Values
-    from pipeline.ingest.commanded_motion import Program
-
 
 ProgramStep: TypeAlias = ProgramRest | ProgramTurn
 SWING_RMS_DEG = np.array([60.0, 42.0, 60.0])  # 42 deg of the middle gimbal: uniform attitudes (``random_gimbals``)

@@ -16,26 +16,22 @@ coefficients x_k, is uncertain by ``e^2 = u sqrt(n) (|z| + sum |x_k| |a_k|)^2``.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from itertools import product
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
+from pipeline.core.records import Index, Mask, Values
 from pipeline.estimation.design import joined_motions, true_motion
 from pipeline.estimation.gauss_markov import WHITE_SETTING, GaussMarkov, Setting
+from pipeline.estimation.observations import Observations
 from pipeline.estimation.ranking import MIN_LEFT_SQUARE_SHARE, MIN_NEW_COLUMN_SHARE, UNIT_COLUMN_RIDGE
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from pipeline.core.records import Index, Mask, Values
-    from pipeline.estimation.observations import Observations
-    from pipeline.estimation.selection import Selection
-    from pipeline.evaluation.diagnosis.functional_forms import Curves
+from pipeline.estimation.selection import Selection
+from pipeline.evaluation.diagnosis.functional_forms import Curves
 
 SETS_OF_AXES = [tuple(c for c in range(3) if code >> c & 1) for code in range(8)]
 UNIT_ROUNDOFF = float(np.finfo(np.float64).eps) / 2.0  # u

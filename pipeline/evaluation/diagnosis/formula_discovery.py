@@ -22,38 +22,31 @@ lists, by complexity, the forms that gain more than all simpler ones.
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, combinations, count, pairwise, starmap
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.core.records import Dependence, FittedForm, RankedFormula
-from pipeline.estimation.design import EffectColumns
+from pipeline.core.records import Dependence, FittedForm, RankedFormula, Values
+from pipeline.estimation.design import Design, EffectColumns
 from pipeline.estimation.gates import MAX_MIN_DELTA_BIC, MIN_DELTA_BIC
+from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.generalized_least_squares import fit_terms
-from pipeline.estimation.observations import without_each_recording, without_rows
+from pipeline.estimation.observations import Observations, without_each_recording, without_rows
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.evaluation.diagnosis import functional_forms as forms
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput
 from pipeline.evaluation.diagnosis.form_scan import FormGain, ProjectedCurves, Scan
-from pipeline.evaluation.diagnosis.functional_forms import Form, Span
+from pipeline.evaluation.diagnosis.functional_forms import Factor, Form, Span
 from pipeline.evaluation.diagnosis.residual_dependence import dependences
 from pipeline.evaluation.diagnosis.words import listed
 from pipeline.physics.effects import catalogue, effect_from, forget, register
 from pipeline.physics.effects.base import unit_of
 from pipeline.physics.formula import SIGNALS, parse
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
-
-    from pipeline.core.records import Values
-    from pipeline.estimation.design import Design
-    from pipeline.estimation.gauss_markov import Setting
-    from pipeline.estimation.observations import Observations
-    from pipeline.evaluation.diagnosis.findings import DiagnosisInput
-    from pipeline.evaluation.diagnosis.functional_forms import Factor
 
 PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
 # least delta BIC of a further term over that of the first: less may be rounding of the first's constants

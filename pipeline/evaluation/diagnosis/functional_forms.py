@@ -12,23 +12,19 @@ scanned constants a, w, c count as parameters of the fit.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
+from pipeline.core.records import Motion, Values
 from pipeline.estimation.design import CURVE_DEGREE
+from pipeline.estimation.observations import Observations
 from pipeline.physics.effects.base import truth, unit_of
 from pipeline.physics.formula import parse
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-    from pipeline.core.records import Motion, Values
-    from pipeline.estimation.observations import Observations
-
 
 CYCLES = range(1, 13)
 POWERS = range(1, 6)

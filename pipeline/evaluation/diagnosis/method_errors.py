@@ -15,27 +15,33 @@ If an effect is missing, bias and sides are not compared, since the effect shift
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from pipeline.core.records import BASE, BASE_COUNT, BIAS, MethodError, matrix_of
+from pipeline.core.records import (
+    BASE,
+    BASE_COUNT,
+    BIAS,
+    MethodError,
+    Motion,
+    Recording,
+    SensorCalibration,
+    Values,
+    matrix_of,
+)
+from pipeline.core.settings import Settings, Table
 from pipeline.estimation.generalized_least_squares import JointFit, fit_terms
 from pipeline.estimation.observations import filtered_motion
+from pipeline.estimation.selection import Selection
 from pipeline.estimation.stages import declarations
 from pipeline.evaluation.diagnosis.words import template
 from pipeline.physics.effects import effect_of
 from pipeline.physics.effects.base import truth, unit_of
 from pipeline.physics.kinematics import table_motion
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.core.records import Motion, Recording, SensorCalibration, Values
-    from pipeline.core.settings import Settings, Table
-    from pipeline.estimation.selection import Selection
 
 MIN_MEAN_SQUARE_SHARE = 0.02  # of the mean square: a smaller part adds less than 1 % to the rms error
 # standard uncertainties: 9 elements of 10^4 units exceed them by chance less than once in 10

@@ -36,38 +36,33 @@ Source: R. D. Cook and S. Weisberg, Residuals and Influence in Regression, 1982,
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
 from numpy.polynomial.chebyshev import chebvander
 
-from pipeline.core.records import BASE_COUNT, Dependence
+from pipeline.core.files import JSON
+from pipeline.core.records import BASE_COUNT, Dependence, Index, Motion, Noise, Values
 from pipeline.estimation.design import CURVE_DEGREE, MAX_CURVE_CYCLES, EffectColumns, placed
 from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Blocks, GaussMarkov, Products, Setting, selection_grid
+from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.multi_position.fit import solve
 from pipeline.estimation.ranking import projection
+from pipeline.estimation.selection import Selection
 from pipeline.evaluation.diagnosis.form_scan import ProjectedCurves, Scan, Whitened, each_explains
 from pipeline.evaluation.diagnosis.functional_forms import Curves, Span, available_signals, columns_of, signals_of
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import Layout, truth, unit_of
 from pipeline.physics.formula import parse
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from pipeline.core.files import JSON
-    from pipeline.core.records import Index, Motion, Noise, Values
-    from pipeline.estimation.multi_position import selection as by_hand
-    from pipeline.estimation.selection import Selection
-
-    Block = tuple[Sequence[int], int]  # curves that are tried together: the first so many of them, and each further one
-    Basis = tuple[str, Callable[[Motion], Values], list[Block]]  # covariate, its curves by motion: (n, q), and blocks
-    Tests = tuple[list[str], Values, Index]  # covariate, delta BIC and number of parameters of each test
-
+Block = tuple[Sequence[int], int]  # curves that are tried together: the first so many of them, and each further one
+Basis = tuple[str, Callable[[Motion], Values], list[Block]]  # covariate, its curves by motion: (n, q), and blocks
+Tests = tuple[list[str], Values, Index]  # covariate, delta BIC and number of parameters of each test
 
 MIN_CYCLES = 3  # periods a turn: one and two look like base and catalogue
 LEAST_RIPPLE = 2  # periods a turn; the catalogue contains one

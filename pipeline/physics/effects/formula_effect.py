@@ -25,9 +25,10 @@ built-in effect that no formula can express states its class (``python: equation
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -46,11 +47,7 @@ from pipeline.physics.effects.base import (
 )
 from pipeline.physics.formula import OF_THE_MOTION, SIGNALS, Formula, c_number, parse
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    Signals = Mapping[str, Values | None]  # None: the recording has no turn axis
-
+Signals: TypeAlias = "Mapping[str, Values | None]"  # None: the recording has no turn axis
 
 AS_DECLARED = (
     *("name", "owner", "sensors", "contains", "prior", "needs_both_directions", "meaning", "excitation", "experiment"),
