@@ -23,8 +23,7 @@ import numpy as np
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import Values
 
-Signals = Mapping[str, Values]
-Evaluate = Callable[[Signals], Any]
+Evaluate = Callable[[Mapping[str, Values]], Any]
 
 # above every shipped formula; they bound the cost
 MAX_FORMULA_LENGTH, MAX_FORMULA_DEPTH, MAX_FORMULA_NODES, LARGEST_POWER = 500, 40, 200, 20.0
@@ -125,7 +124,7 @@ class Formula:
     _evaluate: Evaluate
     _c: str
 
-    def __call__(self, signals: Signals) -> Values:
+    def __call__(self, signals: Mapping[str, Values]) -> Values:
         """Return the value, in the shape to which the signals broadcast; 0-d where the formula names no signal.
 
         Undefined values (``log(-1)``) are NaN or infinite, without a warning.

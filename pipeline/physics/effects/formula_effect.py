@@ -47,7 +47,7 @@ from pipeline.physics.effects.base import (
 )
 from pipeline.physics.formula import OF_THE_MOTION, SIGNALS, Formula, c_number, parse
 
-Signals: TypeAlias = "Mapping[str, Values | None]"  # None: the recording has no turn axis
+MotionSignals: TypeAlias = "Mapping[str, Values | None]"  # None: the recording has no turn axis
 
 AS_DECLARED = (
     *("name", "owner", "sensors", "contains", "prior", "needs_both_directions", "meaning", "excitation", "experiment"),
@@ -180,7 +180,7 @@ class FormulaEffect(DeclaredEffect):
             "record it, or remove the effect from the configuration"
         )
 
-    def _check_finite(self, signals: Signals, motion: Motion) -> None:
+    def _check_finite(self, signals: MotionSignals, motion: Motion) -> None:
         """Raise ``InputError`` for a formula that is not finite where its signals are finite."""
         for axis, formula in (item for term in (*self._by_axis, *self._shared) for item in term.formulas.items()):
             used = {name: signal for name, signal in _of_axis(signals, axis).items() if name in formula.signals}
@@ -197,7 +197,7 @@ class FormulaEffect(DeclaredEffect):
                 )
 
 
-def _of_axis(signals: Signals, axis: str) -> dict[str, Values]:
+def _of_axis(signals: MotionSignals, axis: str) -> dict[str, Values]:
     """Return the known signals, with u of one axis; of all axes if ``axis`` is empty."""
     known = {name: signal for name, signal in signals.items() if signal is not None}
     if axis and "u" in known:
@@ -206,7 +206,7 @@ def _of_axis(signals: Signals, axis: str) -> dict[str, Values]:
     return known
 
 
-def _value(term: Term, signals: Signals, n: int) -> Values:
+def _value(term: Term, signals: MotionSignals, n: int) -> Values:
     """Return a term's value, (n, 1) or (n, 3) array; zeros where the motion has no turn axis for its signals."""
     parts = []
     for axis, formula in term.formulas.items():
