@@ -172,19 +172,15 @@ class Progress:
             for kind, after, seconds in current
         ]
         waiting = self.wanted - Counter(job.kind for job in (*self.done, *self.running.values()))
-        per_job = {kind: usual[kind] * (self._mean_batch() if kind in PER_BATCH else 1.0) for kind in waiting}
+        mean_batch = sum(self.batches.values()) / max(len(self.batches), 1)
+        per_job = {kind: usual[kind] * (mean_batch if kind in PER_BATCH else 1.0) for kind in waiting}
         total = sum(running) + sum(per_job[kind] * count for kind, count in waiting.items())
         parallel_jobs = max(worked / max(time.monotonic() - self.started, 1e-3), 1.0)
-        later = waiting.keys() - {kind for kind, *_ in current}
-        serial = sum(per_job[kind] * self._serial_jobs(kind, waiting[kind]) for kind in later)
+        serial = 0.0  # of the jobs that follow each other in one batch
+        for kind in waiting.keys() - {kind for kind, *_ in current}:
+            at_once = len(self.batches) * (2 if kind.startswith("fit") else 1)
+            serial += per_job[kind] * math.ceil(waiting[kind] / at_once)
         return max(total / parallel_jobs, max(running, default=0.0) + serial)
-
-    def _serial_jobs(self, kind: str, count: int) -> int:
-        """Return how many of ``count`` jobs follow each other in one batch."""
-        return math.ceil(count / (len(self.batches) * (2 if kind.startswith("fit") else 1)))
-
-    def _mean_batch(self) -> float:
-        return sum(self.batches.values()) / max(len(self.batches), 1)
 
 
 def _usual(kind: str, scale: float, measured: Sequence[tuple[str, int, float]]) -> float:

@@ -216,7 +216,9 @@ def explain(
         validation, calibration = (
             _json(folder / kind / f"{unit}.json") or {} for kind in ("validations", "calibrations")
         )
-        name, ordered = document.get("unit", unit), sorted(SENSORS, key=lambda s: _urgency(document.get(s)))
+        name = document.get("unit", unit)
+        places = {s: place(part["verdict"]) if (part := document.get(s)) else len(Verdict) + 1 for s in SENSORS}
+        ordered = sorted(SENSORS, key=places.__getitem__)  # first what can be added and what is in doubt
         words = {s: in_words(document.get(s), s) for s in ordered}
         units.append({
             "name": name,
@@ -257,11 +259,6 @@ def _notes(calibration: JSON) -> list[str]:
         {s: "" if part.get("converged", True) else NOT_CONVERGED for s, part in parts.items()},
     ]
     return notes + [f"{s.capitalize()}: {words}." for of_kind in lacks for s, words in of_kind.items() if words]
-
-
-def _urgency(part: Mapping[str, Any] | None) -> int:
-    """Return the place of a sensor in a list that begins with what can be added and what is in doubt."""
-    return place(part["verdict"]) if part else len(Verdict) + 1
 
 
 def _is_diagnosis(document: object) -> bool:

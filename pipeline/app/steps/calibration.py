@@ -189,8 +189,9 @@ def _on_board(job: Job, unit: str, board: Board) -> dict[str, Any]:
 def _chip(job: Job, unit: str) -> Chip:
     """Return a chip of a board, with the recordings and calibrations of its unit."""
     stored, settings = StoredUnit(job, unit), job.units[unit]
-    reasons = not_calibrated(stored.fits, stored.validated, settings)
-    found = {s: None if s in reasons else c for s, c in calibrated(stored.fits).items()}
+    fits = stored.fits
+    reasons = not_calibrated(fits, stored.validated, settings)
+    found = {s: None if s in reasons else c for s, c in calibrated(fits).items()}
     return Chip(unit, stored.checked, found, settings.sensor)
 
 

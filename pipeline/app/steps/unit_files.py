@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,28 +24,33 @@ def recordings_of(packs: Mapping[str, Pack], unit: str) -> list[Recording]:
 
 
 class StoredUnit:
-    """A unit of a job: what its steps read (``pipeline.unit.UnitState``), loaded from files on first use."""
+    """A unit of a job: what its steps read (``pipeline.unit.UnitState``), loaded from files."""
+
+    validation = property(lambda self: self.document("validate"))
+    diagnosis = property(lambda self: self.document("diagnose"))
+    calibration = property(lambda self: self.document("calibration"))
 
     def __init__(self, job: Job, unit: str) -> None:
         self.job, self.unit = job, unit
 
-    def _json(self, stage: str) -> Any:  # noqa: ANN401  (a JSON document)
+    def document(self, stage: str) -> Any:  # noqa: ANN401  (a JSON document)
+        """Return the document that an earlier stage wrote of the unit."""
         return self.job.inputs[stage].json(f"{self.unit}.json")
 
-    @cached_property
+    @property
     def files(self) -> UnitFiles:
         """Files of the recordings."""
         directory = Path(self.job.run["directory"])
         folder = directory / self.job.units[self.unit].procedure.folder
         return UnitFiles(directory, folder, self.job.inputs.get("recordings"))
 
-    @cached_property
+    @property
     def checked(self) -> list[Recording]:
         """Recordings as ingest returned them."""
         pack = self.job.inputs["ingest"]
         return from_parquet(pack.read(f"{self.unit}.parquet"), str(pack.path))
 
-    @cached_property
+    @property
     def recordings(self) -> UnitRecordings:
         """Recordings as the filter returned them."""
         filtered = recordings_of(self.job.inputs, self.unit)
@@ -54,39 +58,24 @@ class StoredUnit:
         noises = {sensor: data and Noise.from_json(data) for sensor, data in found.items()}
         return UnitRecordings(filtered, noises)
 
-    @cached_property
+    @property
     def fits(self) -> dict[str, Fit]:
         """Fit of each sensor; in a job of the stage fit, that of the stage before."""
         if self.job.stage == "fit":
             sensor = self.job.run["sensor"]
-            return {sensor: fit_from_json(sensor, self._json("previous"))} if "previous" in self.job.inputs else {}
-        return {sensor: fit_from_json(sensor, self._json(sensor)) for sensor in SENSORS}
+            return {sensor: fit_from_json(sensor, self.document("previous"))} if "previous" in self.job.inputs else {}
+        return {sensor: fit_from_json(sensor, self.document(sensor)) for sensor in SENSORS}
 
     @property
     def validated(self) -> Validation:
         """Errors on held-out motion."""
         return Validation.from_json(self.validation)
 
-    @cached_property
-    def validation(self) -> dict[str, Any]:
-        """``validations/<unit>.json``."""
-        return dict(self._json("validate"))
-
-    @cached_property
-    def diagnosis(self) -> dict[str, Any]:
-        """``diagnoses/<unit>.json``."""
-        return dict(self._json("diagnose"))
-
-    @cached_property
+    @property
     def omissions(self) -> list[dict[str, Any]]:
         """Records of what the stages diagnose and export could not make."""
         name, packs = self.unit + INCOMPLETE_SUFFIX, (self.job.inputs[stage] for stage in ("diagnose", "export"))
         return [record for pack in packs if name in pack for record in pack.json(name)]
-
-    @cached_property
-    def calibration(self) -> dict[str, Any]:
-        """``calibrations/<unit>.json``."""
-        return dict(self._json("calibration"))
 
 
 def _files_of_filter(unit: str, result: UnitRecordings) -> Files:

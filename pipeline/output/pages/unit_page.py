@@ -102,6 +102,8 @@ def render(
             shown |= _sensor(sensor, calibration, validation, found, fits, recordings=recordings, settings=settings)
             shown |= _sentences(words.get(sensor) or [], found)
         sensors.append(shown)
+    determining = settings.only(settings.model_fields_set - {"stated", "certificate"})
+    determining["config_sha256"] = settings.stated.config_sha256
     page: str = template("unit.html").render(
         calibration=calibration,
         ok=ok,
@@ -125,7 +127,7 @@ def render(
         environment=environment if recordings else None,
         row={k: v for k, v in settings.stated.row.items() if v},
         command=run_command(settings.stated.run) if settings.stated.run else None,
-        settings_text=json_text(_shown(settings)),
+        settings_text=json_text(dict(sorted(determining.items()))),
     )
     return page
 
@@ -245,12 +247,6 @@ def _sentences(words: Sequence[str], found: JSON) -> JSON:
         "further": further,
         "next_step": "" if found.get("verdict") == Verdict.NOTHING_MISSING and step.startswith("none") else step,
     }
-
-
-def _shown(settings: Settings) -> JSON:
-    """Return the settings that the page shows: what determines the results, and its digest."""
-    sections = settings.only(settings.model_fields_set - {"stated", "certificate"})
-    return dict(sorted({**sections, "config_sha256": settings.stated.config_sha256}.items()))
 
 
 def files_read(inputs: list[JSON] | None) -> list[JSON]:
