@@ -19,6 +19,7 @@ import io
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -41,6 +42,7 @@ __all__ = [
     "load_profile", "propose", "read", "read_frame", "write"
 ]  # fmt: skip
 CANONICAL_CSV = "canonical_csv"
+AT_FIRST_USE = {"Log": "log", "Note": "log", "Profile": "profile", "load_profile": "profile"}  # module of each name
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 
@@ -49,14 +51,8 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401  (a class or a function)
 
     They need numpy or pydantic, which a program that only looks up files does not load.
     """
-    if name in ("Log", "Note"):
-        from imu_logs.log import Log, Note  # noqa: PLC0415  (see above)
-
-        return Log if name == "Log" else Note
-    if name in ("Profile", "load_profile"):
-        from imu_logs.profile import Profile, load_profile  # noqa: PLC0415  (likewise)
-
-        return Profile if name == "Profile" else load_profile
+    if name in AT_FIRST_USE:
+        return getattr(import_module(f"imu_logs.{AT_FIRST_USE[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

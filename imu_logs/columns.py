@@ -14,21 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from imu_logs import units
 from imu_logs.errors import IngestError
 from imu_logs.files import BINARY, is_binary
 from imu_logs.log import Values
 from imu_logs.profile import COMMENTED, DROP, GAP
-from imu_logs.units import (
-    BRACKETS,
-    CHANNELS,
-    FORCE_UNITS,
-    GYROSCOPE,
-    SPELLINGS,
-    TRIADS,
-    UNITS,
-    unit_in_brackets,
-    unit_spelt,
-)
 
 Triad = tuple[int, int, int]
 
@@ -49,47 +39,13 @@ WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d")
 MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|om|omega|rot|rate)([xyz])")
 IN_G = re.compile(r"[xyz]_?g", re.IGNORECASE)  # a rate, or a specific force in g
 AXIS_WORDS = ("x", "y", "z", "0", "1", "2", "3")
-SENSOR_WORDS = {
-    "accelerometer": {"a", "ac", "acc", "accl", "accel", "accelerometer", "acceleration", "f", "force"},
-    "gyroscope": {
-        "g", "gy", "gyr", "gyro", "gyroscope", "w", "om", "omega", "rotation", "rot", "angular", "rate", "rates",
-    },
-}  # fmt: skip
-# Words of columns that hold no readings: other sensors, estimates, and acceleration without gravity.
-NO_SENSOR = {
-    "mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias", "free",
-    "transform", "transforms", "orientation", "quaternion", "quat", "euler", "pose", "position",
-}  # fmt: skip
-COUNTER_WORDS = {
-    "counter", "count", "number", "packet", "packets", "seq", "sequence", "sample", "samples", "index", "frame",
-}  # fmt: skip
+WORDS = {meaning: set(words.split()) for meaning, words in units.NAMES["words"].items()}
+NO_SENSOR = WORDS["no_readings"]  # of other sensors, of estimates, and of acceleration without gravity
 BODY_RATES = ("p", "q", "r")  # about x, y and z, in aeronautics (ISO 1151-1)
 COMMENTS = ("#", "%", "//")  # starts of lines that are no data
 NOT_FINITE = ("", "nan", "-nan", "inf", "-inf", "+inf", "null", "none")  # cells without a number
 MAX_BAD_ROWS = 0.01  # of the rows; a column with more of other text is no column of numbers
-TIME_FIRST = {
-    "t", "ts", "sec", "secs", "ms", "us", "ns", "msec", "usec", "nsec", "tow", "utc", "epoch", "elapsed", "date",
-    "uhrzeit",
-}  # fmt: skip
-TIME_WORDS = {
-    "time", "timestamp", "stamp", "datetime", "millis", "micros", "nanos", "seconds", "milliseconds", "microseconds",
-    "nanoseconds", "ticks", "zeit", "tiempo", "temps",
-}  # fmt: skip
-TABLE_WORDS = {"table", "turntable", "encoder", "enc", "shaft"}
-TEMPERATURE_WORDS = {"temp", "temperature", "tmp"}
-OTHER_TEMPERATURES = {"baro", "barometer", "battery", "cpu"}
-TABLE_CHANNEL_WORDS = {
-    "table_rate": {"rate", "speed", "velocity", "vel", "dps"},
-    "table_angle": {"angle", "position", "pos", "deg", "cdeg", "encoder", "enc"},
-}
 SQUARED = (["s"], ["ms"], ["mps"])  # words before a 2 that is an exponent, not an axis
-UNIT_ENDINGS = (
-    ("m/s^2", ("m s 2", "mps 2", "ms 2")), ("deg/s", ("dps", "deg s", "degps")),
-    ("mdps", ("mdps", "mdeg s")), ("rad/s", ("rad s", "rads", "radps", "rad")), ("degC", ("degc", "deg c", "c")),
-    ("mg", ("mg",)), ("ug", ("ug",)), ("g", ("g",)),
-    ("s", ("s", "sec", "seconds")), ("ms", ("ms", "millis", "msec", "milliseconds")),
-    ("us", ("us", "micros", "usec", "microseconds")), ("ns", ("ns", "nanos", "nsec", "nanoseconds")), ("deg", ("deg",)),
-)  # fmt: skip
 LINES_TRIED = 400  # with each separator
 TEXT_TRIED = 1 << 16  # bytes that show whether a file is a text
 BYTES_OF_A_CHARACTER = 4  # at most, of UTF-8
@@ -139,7 +95,7 @@ def whole(values: Values) -> bool:
 
 def words_of(name: str) -> list[str]:
     """Return the words of a name in lower case, without brackets at its end unless they contain an axis."""
-    bracket = BRACKETS.search(name)
+    bracket = units.BRACKETS.search(name)
     axis = bracket is not None and bracket.group(1).strip().lower() in AXIS_WORDS
     words = [w.lower() for w in WORD.findall(name if axis or bracket is None else name[: bracket.start()])]
     merged = [(w, MERGED.fullmatch(w)) for w in words]
@@ -148,21 +104,21 @@ def words_of(name: str) -> list[str]:
 
 def stated_unit(name: str, channel: str) -> tuple[str | None, str]:
     """Return the unit that a name states for a channel, in brackets or in its last words, and the evidence."""
-    unit = unit_in_brackets(name)
+    unit = units.unit_in_brackets(name)
     words = [w.lower() for w in WORD.findall(name)]
     while words and (words[-1] in ("x", "y", "z", "0", "1", "3") or (words[-1] == "2" and words[-2:-1] not in SQUARED)):
         words = words[:-1]
     ending = " ".join(words)
-    if unit not in UNITS[channel]:
+    if unit not in units.UNITS[channel]:
         matching = [
             candidate
-            for candidate, spellings in UNIT_ENDINGS
+            for candidate, spellings in units.NAMES["endings"].items()
             for s in spellings
-            if candidate in UNITS[channel]
-            and (ending.endswith(f" {s}") or (ending == s and s in TIME_FIRST | TIME_WORDS))
+            if candidate in units.UNITS[channel]
+            and (ending.endswith(f" {s}") or (ending == s and s in WORDS["time_first"] | WORDS["time"]))
         ]
-        unit = matching[0] if matching else SPELLINGS.get(words[-1]) if len(words) > 1 else None
-    return (unit, f"the name says {unit}") if unit in UNITS[channel] else (None, "")
+        unit = matching[0] if matching else units.SPELLINGS.get(words[-1]) if len(words) > 1 else None
+    return (unit, f"the name says {unit}") if unit in units.UNITS[channel] else (None, "")
 
 
 def find_columns(log: UnknownLog) -> Columns:
@@ -171,7 +127,7 @@ def find_columns(log: UnknownLog) -> Columns:
     words = {i: words_of(log.names[i]) if log.named else [] for i in log.numbers}
     _find_time(columns, words)
     times = columns.of_time()
-    for sensor in (*TRIADS, "?"):
+    for sensor in (*units.TRIADS, "?"):
         named = {i: w for i, w in words.items() if i not in times and sensor_of(w) == sensor}
         triad = _triad(named)
         if triad is not None:
@@ -216,12 +172,14 @@ def _triads_by_one_letter(log: UnknownLog) -> dict[str, Triad]:
             groups.setdefault((name[:at], name[at + 1 :]), {})[name[at]] = index
     triads: dict[str, Triad] = {}
     single = {words_of(log.names[i])[0]: i for i in log.numbers if log.named and len(words_of(log.names[i])) == 1}
-    if set(BODY_RATES) <= single.keys() and any(stated_unit(log.names[single[n]], GYROSCOPE[0])[0] for n in BODY_RATES):
+    if set(BODY_RATES) <= single.keys() and any(
+        stated_unit(log.names[single[n]], units.GYROSCOPE[0])[0] for n in BODY_RATES
+    ):
         triads["gyroscope"] = (single["p"], single["q"], single["r"])
     for (before, after), axes in groups.items():
         adjacent = {*re.findall("[a-z]+$", before), *re.findall("^[a-z]+", after)}
-        for sensor, sensor_words in SENSOR_WORDS.items():
-            if len(axes) == len("xyz") and adjacent & sensor_words:
+        for sensor in units.TRIADS:
+            if len(axes) == len("xyz") and adjacent & WORDS[sensor]:
                 triads.setdefault(sensor, (axes["x"], axes["y"], axes["z"]))
     return triads
 
@@ -237,18 +195,18 @@ def sensor_of(words: list[str]) -> str:
     if not axis or set(words) & NO_SENSOR:
         return ""
     before = words[: len(words) - 1 - words[::-1].index(axis)]
-    return next((s for s, known in SENSOR_WORDS.items() if set(before) & known), "" if before else "?")
+    return next((s for s in units.TRIADS if set(before) & WORDS[s]), "" if before else "?")
 
 
 def _other_channel(name: str, words: list[str]) -> str:
     """Return the channel other than time and readings that a name states, empty for none."""
-    canonical = [c for c in CHANNELS[6:] if name.lower().startswith(c)]
+    canonical = [c for c in units.CHANNELS[6:] if name.lower().startswith(c)]
     if canonical:
         return canonical[0]
-    if set(words) & TEMPERATURE_WORDS and not set(words) & OTHER_TEMPERATURES:
+    if set(words) & WORDS["temperature"] and not set(words) & WORDS["other_temperature"]:
         return "temperature"
-    if set(words) & TABLE_WORDS:
-        return next((c for c, known in TABLE_CHANNEL_WORDS.items() if set(words) & known), "")
+    if set(words) & WORDS["table"]:
+        return next((c for c in ("table_rate", "table_angle") if set(words) & WORDS[c]), "")
     return ""
 
 
@@ -257,11 +215,11 @@ def _find_time(columns: Columns, words: dict[int, list[str]]) -> None:
     numbers = columns.log.numbers
     rising = [i for i, v in numbers.items() if len(v) > 2 and bool(np.all(np.diff(v) > 0))]
     counters = [i for i, v in numbers.items() if len(v) > 2 and bool(np.mean(np.diff(v) == 1.0) > COUNTING)]
-    of_sensor = {i: w for i, w in words.items() if w and not set(w) & TABLE_WORDS}
-    named = [i for i, w in of_sensor.items() if w[0] in TIME_FIRST or set(w) & TIME_WORDS]
+    of_sensor = {i: w for i, w in words.items() if w and not set(w) & WORDS["table"]}
+    named = [i for i, w in of_sensor.items() if w[0] in WORDS["time_first"] or set(w) & WORDS["time"]]
     of_arrays = [i for i, v in numbers.items() if columns.log.arrays and _never_falls(v)]
     first = [i for i in of_arrays if columns.log.names[i].partition(" [")[0].endswith("[0]")]
-    counting = {i for i, w in of_sensor.items() if set(w) & COUNTER_WORDS and not set(w) & TIME_WORDS}
+    counting = {i for i, w in of_sensor.items() if set(w) & WORDS["counter"] and not set(w) & WORDS["time"]}
     counters += [i for i in rising if i in counting and i not in counters]
     if not columns.log.named:  # a time that some rows repeat or that starts again; a slow reading may rise, too
         steps = {i: np.diff(v) for i, v in numbers.items() if v[0] >= 0}
@@ -352,7 +310,7 @@ def _spread(log: UnknownLog, triad: Triad, offset: float) -> float:
 def is_gravity(log: UnknownLog, triad: Triad) -> bool:
     """Return whether the length of vectors is gravity in g or m/s^2, or about it; a pressure in hPa would be mg."""
     size = float(np.median(np.linalg.norm([log.numbers[i] for i in triad], axis=0)))
-    near = any(abs(size / FORCE_UNITS[unit] - 1.0) < LOW_COST_ERROR for unit in ("g", "m/s^2"))
+    near = any(abs(size / units.FORCE_UNITS[unit] - 1.0) < LOW_COST_ERROR for unit in ("g", "m/s^2"))
     return near and _spread(log, triad, 0.0) < OF_A_RATE
 
 
@@ -532,7 +490,7 @@ def _names(lines: list[str], start: int, separator: str) -> tuple[list[str], int
         if not by_index or len({*names}) == width or len(cells) != width or not all(cells[1:]):
             break
         pairs = zip(cells, names, strict=True)
-        names = [f"{cell} [{n}]".strip() if unit_spelt(n) else f"{cell} {n}".strip() for cell, n in pairs]
+        names = [f"{cell} [{n}]".strip() if units.unit_spelt(n) else f"{cell} {n}".strip() for cell, n in pairs]
     return names, start - 1, comment, by_index
 
 

@@ -32,26 +32,11 @@ class InputError(UserError):
 class IngestError(InputError):
     """A recording cannot be used.
 
-    Parameters
-    ----------
-    message : str
-        What is wrong and where, with the facts.
-    code : str
-        A code of ``docs/bad_inputs.md``: ``not_a_number``, ``wrong_sense`` ...
-    offset : int, optional
-        Byte of the file at which the error was found.
-    hint : str
-        What the user can do.
-
-    Attributes
-    ----------
-    fact : str
-        The message without byte and hint.
-    sessions : int
-        Number of parts of a log whose logger was restarted.
+    ``message``: what is wrong and where, with the facts, kept as ``fact``. ``code``: of ``docs/bad_inputs.md``, such as
+    ``not_a_number``. ``offset``: byte of the file at which the error was found. ``hint``: what the user can do.
     """
 
-    sessions: int = 0
+    sessions: int = 0  # parts of a log whose logger was restarted
 
     def __init__(
         self, message: str, file: str | None = None, *, code: str = "damaged", offset: int | None = None, hint: str = ""

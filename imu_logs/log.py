@@ -59,39 +59,17 @@ class Note:
 
 @dataclass(frozen=True)
 class Log:
-    """A log that was read.
+    """A log that was read; channels are those of ``imu_logs.units.CHANNELS``."""
 
-    Attributes
-    ----------
-    path : str
-        Of the file, for messages.
-    time_ns : (n,) array of int64
-        Time of each row, ns, in the clock of the log: since power-on, or since 1970.
-    values : dict
-        Channel (``imu_logs.units.CHANNELS``) to (n,) array, in the unit of ``units``.
-    source : dict
-        ``file``, ``sha256`` and ``rows`` of the file; ``joined``: those of further files.
-    lines : (n,) array of int64, optional
-        Line of each row, counted from 1; None for a format without lines.
-    count_sizes : dict
-        Channels that are logged as counts, to one count in the channel's unit.
-    notes : tuple of Note
-        What was found or repaired.
-    flags : (n,) array of uint16, optional
-        ``REPAIRED`` where the row was moved.
-    apart : tuple of Log
-        Logs of the same recording with a clock of their own, such as that of a table.
-    """
-
-    path: str
-    time_ns: Integers
-    values: dict[str, Values]
-    source: dict[str, Any]
-    lines: Integers | None = None
-    count_sizes: dict[str, float] = field(default_factory=dict)
-    notes: tuple[Note, ...] = ()
-    flags: NDArray[np.uint16] | None = None
-    apart: tuple[Log, ...] = ()
+    path: str  # of the file, for messages
+    time_ns: Integers  # (n,), time of each row, ns, in the clock of the log: since power-on, or since 1970
+    values: dict[str, Values]  # channel to (n,) array, in the unit of ``units``
+    source: dict[str, Any]  # ``file``, ``sha256`` and ``rows`` of the file; ``joined``: those of further files
+    lines: Integers | None = None  # (n,), line of each row, counted from 1; None for a format without lines
+    count_sizes: dict[str, float] = field(default_factory=dict)  # one count of channels that are logged as counts
+    notes: tuple[Note, ...] = ()  # what was found or repaired
+    flags: NDArray[np.uint16] | None = None  # (n,), ``REPAIRED`` where the row was moved
+    apart: tuple[Log, ...] = ()  # logs of the recording with a clock of their own, such as that of a table
 
     @property
     def units(self) -> dict[str, str]:

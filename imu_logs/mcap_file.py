@@ -99,8 +99,7 @@ class ChannelMessages:
         """Return all messages as an array of a structured type; they must have the size of that type."""
         if self.stride:
             return np.ndarray(len(self.starts), layout, self.data.data, int(self.starts[0]), (self.stride,))
-        windows = sliding_window_view(self.data, layout.itemsize)[self.starts]
-        return np.asarray(windows.view(layout)[:, 0])
+        return np.asarray(sliding_window_view(self.data, layout.itemsize)[self.starts].view(layout)[:, 0])
 
 
 @dataclass

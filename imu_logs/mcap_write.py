@@ -60,7 +60,7 @@ TOPICS = {
     QUATERNION_STAMPED: "/table/attitude",
 }
 # Of each type, with those of the types in it.
-DEFINITIONS = {kind: (MESSAGES / f"{kind.rpartition('/')[2]}.msg").read_text("ascii") for kind in TOPICS}
+DEFINITIONS = {kind: (MESSAGES / f"{kind.rpartition('/')[2]}.msg").read_text("utf-8") for kind in TOPICS}
 JOINT = "table"
 # Vector of an Imu message: sensor, its unit, and one g or deg/s in that unit.
 VECTORS = {
@@ -124,10 +124,8 @@ def _streams(log: Log) -> dict[str, NDArray[np.uint8]]:
     if "temperature" in values:
         numbers = np.stack([values["temperature"], np.zeros(len(time))], axis=1)
         streams[TEMPERATURE] = as_messages(time, "imu", numbers)
-    joint = (
-        values.get("table_angle"),
-        values.get("table_rate"),
-    )  # position and velocity of the table's one joint; no effort
+    # position and velocity of the table's one joint; no effort
+    joint = values.get("table_angle"), values.get("table_rate")
     if any(logged is not None for logged in joint):
         parts: list[bytes | Values] = [_count(1) + _text(JOINT)]
         for logged in joint:

@@ -26,52 +26,39 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from mcap.records import Channel, Schema
 
+from imu_logs import message_layout as layouts
 from imu_logs.clocks import MAX_NANOSECONDS, nanoseconds, of_number, of_pair
 from imu_logs.errors import IngestError
 from imu_logs.log import Index, Integers, Mask, Values, in_house_unit
 from imu_logs.mcap_file import ChannelMessages, MessageReader
 from imu_logs.mcap_write import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE, VECTORS
-from imu_logs.message_layout import (
-    ONLY,
-    ROS1_TIME,
-    ROS2_TIME,
-    STAMPS,
-    MessageLayout,
-    Place,
-    find_layout,
-    number_at,
-    parse_definition,
-    place_of,
-    short_name,
-    stamp_at,
-)
 from imu_logs.profile import HEADER, TIME, FieldPath, MappedField, McapFormat
 from imu_logs.units import ATTITUDE, COUNTS, TRIADS, UNITS, unit_spelt
 
 T = TypeVar("T")
 SUPPORTED = "cdr with ros2msg, ros1 with ros1msg, protobuf with protobuf, and json are supported"
-ROS_TIMES = {("cdr", "ros2msg"): ROS2_TIME, ("ros1", "ros1msg"): ROS1_TIME}
+ROS_TIMES = {("cdr", "ros2msg"): layouts.ROS2_TIME, ("ros1", "ros1msg"): layouts.ROS1_TIME}
 SECONDS, NANOSECONDS = "\0seconds", "\0nanoseconds"  # columns of a moment; no channel has such a name
 ARRAYS = "arrays"  # encoding of messages made of arrays; the definition is JSON: name, byte, type, count of each
 MAPPED = "mapped"  # the kind of a topic whose fields the profile names; other kinds are ROS types
-KINDS = {short_name(kind): kind for kind in (IMU, TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED)}
+KINDS = {layouts.short_name(kind): kind for kind in (IMU, TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED)}
 STATED = "unit of "  # before a field's name in the metadata of a channel: the unit that the file states
 MOST_LAYOUTS = 32  # in a run; messages of further layouts are read one by one, which bounds the cost
-FindLayout = Callable[[bytes], MessageLayout]
+FindLayout = Callable[[bytes], layouts.MessageLayout]
 Decode = Callable[[bytes], Any]
 
 
 def ros_layouts(channel: Channel, schema: Schema | None) -> FindLayout | None:
     """Return a function that finds the layout of a channel's messages (ROS or arrays); None for other encodings."""
     if schema is not None and schema.encoding == ARRAYS:
-        places = {name: Place(byte, code, count) for name, byte, code, count in json.loads(schema.data)}
-        return lambda payload: MessageLayout(payload, places)
+        places = {name: layouts.Place(byte, code, count) for name, byte, code, count in json.loads(schema.data)}
+        return lambda payload: layouts.MessageLayout(payload, places)
     if schema is None or (channel.message_encoding, schema.encoding) not in ROS_TIMES:
         return None
     times, cdr = ROS_TIMES[channel.message_encoding, schema.encoding], channel.message_encoding == "cdr"
-    definitions = parse_definition(schema.name, schema.data.decode("utf-8"), times)
-    root = short_name(schema.name)
-    return lambda payload: find_layout(root, definitions, payload, cdr=cdr)
+    definitions = layouts.parse_definition(schema.name, schema.data.decode("utf-8"), times)
+    root = layouts.short_name(schema.name)
+    return lambda payload: layouts.find_layout(root, definitions, payload, cdr=cdr)
 
 
 def object_decoder(channel: Channel, schema: Schema | None) -> Decode | None:
@@ -85,15 +72,15 @@ def object_decoder(channel: Channel, schema: Schema | None) -> Decode | None:
     return DecoderFactory().decoder_for("protobuf", schema)
 
 
-def _stamp_places(path: FieldPath | None, layout: MessageLayout) -> dict[str, tuple[int, str]]:
+def _stamp_places(path: FieldPath | None, layout: layouts.MessageLayout) -> dict[str, tuple[int, str]]:
     """Return the places of the seconds and nanoseconds of a time, or of its single number."""
     if path is None:
         return {}
-    for seconds, nanos in STAMPS:
+    for seconds, nanos in layouts.STAMPS:
         pair = [layout.places.get(f"{path.text}.{name}") for name in (seconds, nanos)]
         if pair[0] is not None and pair[1] is not None:
             return {SECONDS: (pair[0].offset, pair[0].code), NANOSECONDS: (pair[1].offset, pair[1].code)}
-    place = place_of(path, layout)
+    place = layouts.place_of(path, layout)
     if place is None:
         raise ValueError(f"{path.text} is an empty list; a moment is expected")
     return {SECONDS: place}
@@ -127,7 +114,7 @@ class MessageBatch(NamedTuple):
         return rows.heads["log_time"].astype(np.int64) if self.time_ns is None else self.time_ns
 
 
-def _together(parts: Sequence[MessageBatch], groups: Sequence[tuple[Index, MessageLayout]]) -> MessageBatch:
+def _together(parts: Sequence[MessageBatch], groups: Sequence[tuple[Index, layouts.MessageLayout]]) -> MessageBatch:
     """Join the messages of all layouts in the order of the file."""
     if len(parts) == 1:
         return parts[0]
@@ -157,9 +144,9 @@ class TopicDecoder:
         self._time_unit = time.unit if time else "ns"
         self.count = self.varying = 0
         self.coarse_time = False
-        self.groups: list[tuple[Index, MessageLayout]] = []
+        self.groups: list[tuple[Index, layouts.MessageLayout]] = []
         self._channels: dict[int, tuple[str, FindLayout | None, Decode | None]] = {}  # type, and what reads a message
-        self._layouts: dict[int, MessageLayout] = {}  # the last one of each channel
+        self._layouts: dict[int, layouts.MessageLayout] = {}  # the last one of each channel
         self._absent: dict[str, bool] = {}  # columns, by the first message
 
     def read(self, rows: ChannelMessages, reader: MessageReader) -> MessageBatch:
@@ -209,7 +196,7 @@ class TopicDecoder:
             raise IngestError(message, self.path, code="unsupported", hint=SUPPORTED)
         return schema.name if schema else "json", find, decode
 
-    def _by_layout(self, rows: ChannelMessages, find: FindLayout) -> Iterator[tuple[Index, MessageLayout]]:
+    def _by_layout(self, rows: ChannelMessages, find: FindLayout) -> Iterator[tuple[Index, layouts.MessageLayout]]:
         """Yield the indices of the messages of each layout, and the layout."""
         remaining = np.arange(len(rows.starts))
         layout = self._layouts.get(rows.channel)
@@ -227,11 +214,11 @@ class TopicDecoder:
         for row in remaining.tolist():
             yield np.array([row]), self._in_message(row, rows, find)
 
-    def _columns(self, rows: ChannelMessages, indices: Index, layout: MessageLayout) -> MessageBatch:
+    def _columns(self, rows: ChannelMessages, indices: Index, layout: layouts.MessageLayout) -> MessageBatch:
         """Return times and columns of the messages of one layout; a column is NaN where the list is empty."""
 
         def find(_: bytes) -> dict[str, tuple[int, str] | None]:
-            places = {name: place_of(path, layout) for name, path in self._paths.items()}
+            places = {name: layouts.place_of(path, layout) for name, path in self._paths.items()}
             return places | _stamp_places(self._time, layout)
 
         def moments(_: bytes) -> Integers | None:
@@ -258,9 +245,9 @@ class TopicDecoder:
         def work(payload: bytes) -> None:
             message = decode(payload)
             for name, path in self._paths.items():
-                numbers[name].append(number_at(path, message))
+                numbers[name].append(layouts.number_at(path, message))
             if self._time is not None:
-                moment = stamp_at(self._time, message)
+                moment = layouts.stamp_at(self._time, message)
                 self.coarse_time |= isinstance(moment, Decimal) and not isinstance(message, dict)  # JSON is decimal
                 moments.append(nanoseconds(moment, self._time_unit))
 
@@ -318,7 +305,7 @@ class Topics:
         channel = reader.channels[rows.channel]
         name, schema = channel.topic, reader.schemas.get(channel.schema_id)
         if name not in self.decoders:
-            kind = KINDS.get(short_name(schema.name), "") if schema else ""
+            kind = KINDS.get(layouts.short_name(schema.name), "") if schema else ""
             known = kind and not (kind == IMU and self.settings.topics)
             if name in self.settings.topics:
                 kind = MAPPED
@@ -337,8 +324,8 @@ def _fields_of(kind: str, settings: McapFormat) -> dict[str, MappedField]:
     elif kind == TEMPERATURE:
         fields["temperature"] = path("temperature"), "degC"
     elif kind == JOINT_STATE:
-        joint = settings.joint or ONLY
-        which = "the only joint" if joint == ONLY else f"joint {joint}"
+        joint = settings.joint or layouts.ONLY
+        which = "the only joint" if joint == layouts.ONLY else f"joint {joint}"
         fields["table_angle"] = FieldPath(f"position of {which}", "position", joint), "rad"
         fields["table_rate"] = FieldPath(f"velocity of {which}", "velocity", joint), "rad/s"
     else:

@@ -69,7 +69,6 @@ class _Topic:
     values: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
 
     def read(self, rows: ChannelMessages, reader: MessageReader) -> None:
-        """Decode the messages of a run."""
         if self.error is not None:
             return
         try:
@@ -110,10 +109,8 @@ class _Topic:
         if self.decoder.varying:
             detail = f"messages on {topic} vary in length or texts, and those of one layout were decoded together"
             notes.append(Note("N-FALLBACK", self.decoder.varying, 0, 0, detail))
-        fields = self.decoder.fields.items()
-        counts = {c: 1.0 / abs(f.counts_per_unit) for c, f in fields if f.unit == COUNTS}
-        source = {"topic": topic, "rows": len(time), **bursts}
-        return Log(path, time, values, source, count_sizes=counts)
+        counts = {c: 1.0 / abs(f.counts_per_unit) for c, f in self.decoder.fields.items() if f.unit == COUNTS}
+        return Log(path, time, values, {"topic": topic, "rows": len(time), **bursts}, count_sizes=counts)
 
 
 def _ordered(
@@ -122,8 +119,7 @@ def _ordered(
     """Return messages in order of time, each once; those that arrive in bursts by a regular clock, the third result."""
     bursts = find_bursts(time, values)
     if bursts is not None and bursts.times is not None:
-        detail = f"{topic}: {bursts.described(len(time))}"
-        note = Note("N-BURSTS", bursts.untimed.size, 0, 0, detail)
+        note = Note("N-BURSTS", bursts.untimed.size, 0, 0, f"{topic}: {bursts.described(len(time))}")
         return bursts.times, values, {"bursts": bursts.clock}, [note]
     try:
         order, notes = in_order(topic, time, list(values.values()), reorder_s, path)

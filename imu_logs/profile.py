@@ -430,19 +430,10 @@ def mcap_format(profile: Profile, place: str = "ingest.mcap") -> McapFormat:
 def load_profile(profile: Mapping[str, Any] | str | os.PathLike[str], **changed: Any) -> Profile:  # noqa: ANN401
     """Return a profile.
 
-    Parameters
-    ----------
-    profile : mapping, str or Path
-        The keys of a profile, the name of a shipped one, or a YAML file. ``defaults`` names shipped profiles that it
-        extends. ``${ingest.instance}`` stands for its key ``instance``.
-    **changed
-        Keys to replace: ``instance``, ``csv``, ``mcap`` or ``checks``; mappings are merged.
-
-    Raises
-    ------
-    ConfigurationError
-        If the profile is unknown or not valid, or refers to a setting of another program, such as
-        ``${sensor.accelerometer.counts_per_unit}``.
+    ``profile``: the keys of a profile, the name of a shipped one, or a YAML file. ``defaults`` names shipped profiles
+    that it extends. ``${ingest.instance}`` stands for its key ``instance``. ``changed``: keys to replace: ``instance``,
+    ``csv``, ``mcap`` or ``checks``; mappings are merged. Raises ``ConfigurationError`` if the profile is unknown or not
+    valid, or refers to a setting of another program, such as ``${sensor.accelerometer.counts_per_unit}``.
     """
     if isinstance(profile, Mapping):
         content, where = dict(profile), "profile"

@@ -496,45 +496,32 @@ def as_yaml(proposal: Proposal, name: str) -> str:
     lines = _comment(f"Proposed by python -m pipeline check for {files}. Check each line: no line is certain.")
     for remark in proposal.remarks:
         lines += _comment(f"To decide: {remark}.")
-    if proposal.topic is not None:
+    topics, shown = proposal.topic is not None, proposal.csv
+    if topics:
         lines += ["defaults:", "  - canonical_csv", "  - _self_", ""]
+        shown = {key: shown[key] for key in ("rate_hz",) if shown[key] is not None}
     lines += [f"name: {_scalar(name)} # name of the profile, for the report", ""]
-    if proposal.topic is not None:
-        return "\n".join(lines + _topics(proposal)) + "\n"
-    lines += ["csv:"]
-    for key, value in proposal.csv.items():
+    lines += ["mcap: # logs of messages of every format" if topics else "csv:"]
+    for key, value in shown.items():
         if key in proposal.evidence:
             lines += _comment(proposal.evidence[key], "  ")
         lines.append(f"  {key}: {_scalar(value)}")
-    if proposal.parts:
-        lines += ["  columns: {} # described by part", "  parts: # files of one recording, joined on equal time"]
-        for part, file in enumerate(proposal.parts):
-            lines += [f"    - file: {_scalar(file)}", "      columns:"]
-            lines += _entries(proposal, part, "        ")
-    else:
-        lines += ["  columns: # channel: the column's name (or index from 0) and its unit"]
-        lines += _entries(proposal, 0, "    ")
-    return "\n".join(lines) + "\n"
-
-
-def _topics(proposal: Proposal) -> list[str]:
-    """Return the section of a profile for logs of messages."""
-    lines = ["mcap: # logs of messages of every format"]
-    if proposal.csv["rate_hz"] is not None:
-        lines += [*_comment(proposal.evidence["rate_hz"], "  "), f"  rate_hz: {_scalar(proposal.csv['rate_hz'])}"]
     if not proposal.parts:
-        return [*lines, "  topics:", f"    {_scalar(proposal.topic)}:", *_entries(proposal, 0, "      ")]
-    lines.append("  parts: # files of one recording, joined on equal time")
+        what = "topics:" if topics else "columns: # channel: the column's name (or index from 0) and its unit"
+        return "\n".join([*lines, f"  {what}", *_entries(proposal, 0, "    ")]) + "\n"
+    lines += [] if topics else ["  columns: {} # described by part"]
+    lines += ["  parts: # files of one recording, joined on equal time"]
     for part, file in enumerate(proposal.parts):
-        lines += [f"    - file: {_scalar(file)}", "      topics:", f"        {_scalar(proposal.logs[part].topic)}:"]
-        lines += _entries(proposal, part, "          ")
-    return lines
+        lines += [f"    - file: {_scalar(file)}", f"      {'topics' if topics else 'columns'}:"]
+        lines += _entries(proposal, part, "        ")
+    return "\n".join(lines) + "\n"
 
 
 def _entries(proposal: Proposal, part: int, indent: str) -> list[str]:
     """Return the entries of a part, the first of each sensor with its evidence, and the columns without an entry."""
-    lines: list[str] = []
-    explained: set[str] = set()
+    topic, explained = proposal.logs[part].topic, set[str]()
+    lines = [] if topic is None else [f"{indent}{_scalar(topic)}:"]
+    indent += "" if topic is None else "  "
     columns, evidence = proposal.columns[part], proposal.evidence
     for channel, entry in (columns if proposal.topic is None else fields_of(columns)).items():
         key = next((s for s, triad in TRIADS.items() if channel in triad), channel)

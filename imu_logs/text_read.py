@@ -410,8 +410,7 @@ def _refusal(table: Log, row: int, starts: list[int]) -> IngestError:
         "to increase"
     )
     hint = "" if repeats else "a log that was restarted belongs in two files"
-    code = "duplicate_time" if repeats else "time_back"
-    error = IngestError(message, table.place(row), code=code, hint=hint)
+    error = IngestError(message, table.place(row), code="duplicate_time" if repeats else "time_back", hint=hint)
     lines = np.arange(1, len(table.time_ns) + 1) if table.lines is None else table.lines
     start, count = next(((a, n) for at, a, n in _repeats(table) if at == row), (row, 0))
     if count > 1:
@@ -458,8 +457,7 @@ def _once(table: Log) -> Log:
             keep[rows] = False
             twin, note = table.note("", rows - count, ""), table.note("N-REPEAT", rows, "")
             lines = f"lines {note.first} to {note.last} repeat lines {twin.first} to {twin.last} exactly"
-            detail = f"{lines}, including the time, and were dropped"
-            notes.append(replace(note, detail=detail))
+            notes.append(replace(note, detail=f"{lines}, including the time, and were dropped"))
     return table.select(np.flatnonzero(keep), *notes) if notes else table
 
 

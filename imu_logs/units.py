@@ -7,8 +7,10 @@ House units are g, deg/s, deg, degC and integer ns. The ingest profile states th
 
 from __future__ import annotations
 
+import json
 import math
 import re
+from pathlib import Path
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 SECOND_NS = 1_000_000_000
@@ -68,17 +70,10 @@ CANONICAL = {
     **{c: c for c in ATTITUDE},
 }
 
-# Spellings of units in the names of columns, lower case and without blanks, to the names used here.
-SPELLINGS = {
-    "mm/s^2": "mm/s^2", "mm/s2": "mm/s^2", "g's": "g", "rad/sec": "rad/s", "radian/s": "rad/s", "radians/s": "rad/s",
-    "deg/sec": "deg/s", "degree/s": "deg/s", "degrees/s": "deg/s", "degrees/sec": "deg/s",
-    "g": "g", "mg": "mg", "m/s^2": "m/s^2", "m/s2": "m/s^2", "m/s²": "m/s^2", "ms^-2": "m/s^2", "m/s/s": "m/s^2",
-    "mps2": "m/s^2", "deg/s": "deg/s", "°/s": "deg/s", "dps": "deg/s", "degs/s": "deg/s", "rad/s": "rad/s",
-    "rads/s": "rad/s", "s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us", "μs": "us", "ns": "ns",
-    "deg": "deg", "°": "deg", "rad": "rad", "degc": "degC", "°c": "degC", "c": "degC", "celsius": "degC",
-    "counts": "counts", "lsb": "counts", "raw": "counts", "digit": "counts", "digits": "counts", "ug": "ug", "µg": "ug",
-    "μg": "ug", "mrad/s": "mrad/s", "mdps": "mdps", "mdeg/s": "mdps", "m°/s": "mdps",
-}  # fmt: skip
+# In the names of columns: spellings of units in brackets, in lower case and without blanks; units at the end of a name,
+# as words; and words by their meaning.
+NAMES = json.loads((Path(__file__).parent / "names.json").read_text(encoding="utf-8"))
+SPELLINGS = {spelling: unit for unit, spellings in NAMES["units"].items() for spelling in spellings.split()}
 BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 
 

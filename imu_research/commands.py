@@ -27,19 +27,9 @@ seeds   simulates the campaign's recordings with every seed and writes FILE (dat
 def study(argv: Sequence[str]) -> int:
     """Run the blind study of the diagnosis: hide random effects, diagnose the units, and count correct answers."""
     from imu_research.figures import write_figures  # noqa: PLC0415
-    from imu_research.study.cases import FAMILIES  # noqa: PLC0415  (not needed for a comparison with the thesis)
-    from imu_research.study.page import DIAGRAM, page  # noqa: PLC0415
+    from imu_research.study import page, run, scores  # noqa: PLC0415  (not needed for a comparison with the thesis)
+    from imu_research.study.cases import FAMILIES  # noqa: PLC0415
     from imu_research.study.result import cases_of  # noqa: PLC0415
-    from imu_research.study.run import RESULTS_FILE, TRUTH_FILE, read_lines, run_study  # noqa: PLC0415
-    from imu_research.study.scores import (  # noqa: PLC0415
-        PROBABILITIES,
-        accepted,
-        answer_scores,
-        false_selection_rates,
-        family_scores,
-        reliability,
-        reliability_diagram,
-    )
     from pipeline.app.run_progress import Countdown  # noqa: PLC0415
 
     parser = parser_of("study", study.__doc__, STUDY.format(", ".join(FAMILIES)))
@@ -60,24 +50,28 @@ def study(argv: Sequence[str]) -> int:
         countdown.total = total
         countdown(done, f"{done} of {total} cases")
 
-    run_study(
+    run.run_study(
         arguments.directory, families, arguments.n, arguments.seed, processes=arguments.processes, progress=progress
     )
     countdown.end()
-    cases = cases_of(read_lines(arguments.directory / TRUTH_FILE), read_lines(arguments.directory / RESULTS_FILE))
-    scores = [*accepted(cases), *family_scores(cases), *answer_scores(cases)]
+    cases = cases_of(*(run.read_lines(arguments.directory / name) for name in (run.TRUTH_FILE, run.RESULTS_FILE)))
+    found = [*scores.accepted(cases), *scores.family_scores(cases), *scores.answer_scores(cases)]
     if arguments.figures:
-        stated = [f._replace(name=f"{of}, stated {f.name}") for of in PROBABILITIES for f in reliability(cases, of)]
-        write_figures(arguments.figures, [*scores, *false_selection_rates(cases), *stated])
-    for score in scores:
+        stated = [
+            f._replace(name=f"{of}, stated {f.name}")
+            for of in scores.PROBABILITIES
+            for f in scores.reliability(cases, of)
+        ]
+        write_figures(arguments.figures, [*found, *scores.false_selection_rates(cases), *stated])
+    for score in found:
         name, n, value, interval, goal = score.cells
         print(f"{name:<92} {n:>5} {value:>8} {interval:<16} {goal:<9} {' '.join(score.misses[:8])}".rstrip())
     if arguments.table:
         command = f"python -m pipeline study DIR --families {arguments.families} --n {arguments.n}"
-        diagram = arguments.table.parent / "images" / DIAGRAM
+        diagram = arguments.table.parent / "images" / page.DIAGRAM
         diagram.parent.mkdir(exist_ok=True)
-        diagram.write_text(reliability_diagram(cases), encoding="utf-8")
-        arguments.table.write_text(page(cases, f"{command} --seed {arguments.seed}"), encoding="utf-8")
+        diagram.write_text(scores.reliability_diagram(cases), encoding="utf-8")
+        arguments.table.write_text(page.page(cases, f"{command} --seed {arguments.seed}"), encoding="utf-8")
     return 0
 
 

@@ -41,7 +41,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from imu_research.study.cases import COURSES, INTERVAL_BY_HAND_S, INTERVAL_S, StudyCase
+from imu_logs.yaml_file import read_yaml
+from imu_research.study.cases import COURSES, INTERVAL_BY_HAND_S, INTERVAL_S, SIZES_FILE, StudyCase
 from pipeline.core.records import SENSORS, Recording, Values
 from pipeline.core.settings import DataSheet
 from pipeline.estimation.engine import scaled_inverse
@@ -56,13 +57,7 @@ from pipeline.simulation.trajectory import Planned, random_gimbals
 
 PERFECT = {"angle_accuracy_deg": 0.0, "rate_error": (0.0, 0.0, 0.0), "direction_deg": [[0.0, 0.0]] * 3}
 OF_WHITE = {"ar_06": 0.6, "ar_09": 0.9}  # coefficient of the autoregression
-AMPLITUDE = {  # g and deg/s; by assumption, near the limits of the MPU-6050's sensor file
-    "gear_mesh": {"accelerometer": 2e-3, "gyroscope": 0.03},
-    "temperature_step": {"accelerometer": 4e-3, "gyroscope": 0.06},
-    "saturation": {"accelerometer": 3e-3, "gyroscope": 0.6},
-    "exponential": {"accelerometer": 3e-3, "gyroscope": 0.6},
-    "band": {"accelerometer": 2e-3, "gyroscope": 0.05},
-}
+AMPLITUDE: dict[str, dict[str, float]] = read_yaml(SIZES_FILE)["amplitude"]  # by shape and sensor
 CURVES: dict[str, Callable[[Values], Values]] = {  # of the scaled temperature
     "temperature_step": lambda x: 0.5 + 0.5 * np.tanh((x - 0.5) / 0.04),
     "saturation": lambda x: np.tanh(4.0 * x),

@@ -77,26 +77,12 @@ TABLE_SHARES = {"acutronic": 0.5, "mark2": 0.45, "single_axis": 0.05}
 RESTS_BY_HAND = 15, 40  # by hand; from 15 on, some are held out of a fit
 CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
 LAG_S = 10.0, 60.0  # of a thermometer, by assumption: packages of grams
-_OF_FILE = read_yaml(Path(__file__).with_name("sizes.yaml"))
+SIZES_FILE = Path(__file__).with_name("sizes.yaml")
+_OF_FILE = read_yaml(SIZES_FILE)
 SIZES: dict[str, dict[str, dict[str, float | list[float]]]] = _OF_FILE["sizes"]  # by model and sensor
 FAINT: dict[str, dict[str, list[str]]] = _OF_FILE["faint"]  # effects that hide in the noise
-# Effects that a procedure does not show, or shows by less than a detection needs (theory: the page of the effect).
-UNSEEN_GYROSCOPE = ("table_tilt", "table_backlash", "table_axis_nonorthogonality")
-SAME_GYROSCOPE = ("table_encoder_error",)  # in a gyroscope its derivative equals a ripple of the rate
-ONE_WAY = {
-    "accelerometer": {"vibration_rectification", "rate_dependence", "table_backlash"},
-    "gyroscope": {"scale_factor_asymmetry", "vibration_rectification"},
-}
-OF_SENSOR_BY_HAND = {  # effects of the sensor that rests in many attitudes, or moves between them, can show
-    "accelerometer": (
-        *("scale_factor_asymmetry", "quadratic_nonlinearity", "cubic_nonlinearity", "cross_axis_nonlinearity"),
-    ),
-    "gyroscope": ("scale_factor_asymmetry", "g_sensitivity", "g_squared_sensitivity"),
-}
-AT_REST = (
-    "lever_arm", "inner_lever_arms", "time_offset", "low_pass_lag", "clock_rate", "vibration_rectification",
-    "rate_dependence",
-)  # fmt: skip
+UNSEEN: dict[str, dict[str, list[str]]] = _OF_FILE["unseen"]  # by procedure and sensor
+SHOWN_BY_HAND: dict[str, list[str]] = _OF_FILE["by_hand"]  # that rests in many attitudes, or moves, can show
 
 
 @dataclass(frozen=True)
@@ -168,7 +154,7 @@ def draw(family: str, number: int, seed: int) -> StudyCase:
             family, number, seed, model, sensor, procedure, shape=detail, amplitude=amplitude, room_degc=room
         )
     if kind == "hand":
-        name = str(rng.choice(OF_SENSOR_BY_HAND[sensor]))
+        name = str(rng.choice(SHOWN_BY_HAND[sensor]))
         hidden = {name: drawn("mpu6050", sensor, name, rng).tolist()}
         rests = int(rng.integers(RESTS_BY_HAND[0], RESTS_BY_HAND[1] + 1)) if detail == "multi_position" else 0
         case = StudyCase(family, number, seed, "mpu6050", sensor, detail, hidden, rests=rests, table="hand")
@@ -215,9 +201,9 @@ def _names(kind: str, model: str, sensor: str, procedure: str, rng: np.random.Ge
 
 def _unseen(number: int, seed: int, rng: np.random.Generator) -> StudyCase:
     """Draw an effect that is not observable: in turns in one direction, of the table to a gyroscope, or at rest."""
-    cells = [("one_way", "gyroscope", name) for name in sorted(ONE_WAY["gyroscope"])]
-    cells += [(way, "gyroscope", name) for way in ("stop_and_go", "one_way") for name in UNSEEN_GYROSCOPE]
-    cells += [("at_rest", "accelerometer", name) for name in AT_REST]
+    cells = [("one_way", "gyroscope", name) for name in sorted(UNSEEN["one_way"]["gyroscope"])]
+    cells += [(way, "gyroscope", name) for way in ("stop_and_go", "one_way") for name in UNSEEN["any"]["gyroscope"][:3]]
+    cells += [("at_rest", "accelerometer", name) for name in UNSEEN["at_rest"]["accelerometer"]]
     procedure, sensor, name = cells[int(rng.integers(len(cells)))]
     hidden = {name: drawn("mpu6050", sensor, name, rng).tolist()}
     return StudyCase("unseen", number, seed, "mpu6050", sensor, procedure, hidden)
@@ -238,10 +224,7 @@ def sensor_files(interval_s: float) -> list[str]:
 def observable(model: str, sensor: str, procedure: str) -> list[str]:
     """Return the effects that are observable with a procedure at their size."""
     hidden = set(FAINT[model][sensor])
-    if sensor == "gyroscope":
-        hidden |= {*UNSEEN_GYROSCOPE, *SAME_GYROSCOPE}
-    if procedure == "one_way":
-        hidden |= ONE_WAY[sensor]
+    hidden.update(UNSEEN["any"].get(sensor, ()), UNSEEN.get(procedure, {}).get(sensor, ()))
     return [name for name in SIZES[model][sensor] if name not in hidden]
 
 

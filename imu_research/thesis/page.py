@@ -144,8 +144,7 @@ def _before_and_after(results: Results, name: str, sensor: str) -> Figure | None
     samples = samples_of_motion(sensor, held_out[0], SILENT, shipped_settings().table) if held_out else None
     if samples is None:
         return None
-    steps = steps_of(results.correction(f"{name}-printed", sensor))
-    calibrated = corrected(steps or (), samples.reading)
+    calibrated = corrected(steps_of(results.correction(f"{name}-printed", sensor)) or (), samples.reading)
     before, after = (np.linalg.norm(v, axis=1) - samples.magnitude for v in (samples.reading, calibrated))
     drawn = held_out_over_time(f"held-out-{name}", sensor, held_out[0], before, after)
     means = [number(float(np.mean(np.abs(e)))) for e in (before, after)]

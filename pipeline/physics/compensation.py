@@ -53,20 +53,9 @@ from pipeline.core.records import (
     SensorCalibration,
     Values,
 )
+from pipeline.physics import measurement
 from pipeline.physics.effects import effect_of, load_python_effect, register
 from pipeline.physics.effects.base import OF_THE_ROOM
-from pipeline.physics.measurement import (
-    FIELDS_OF_SIGNALS,
-    ExponentialRegression,
-    LogEnd,
-    SensorEffects,
-    Truths,
-    fields_used,
-    log_motion,
-    sensor_effects,
-    solve,
-    without_effects,
-)
 
 # Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
 # (2 to 32 g), 32 between those of a gyroscope (125 to 4000 deg/s), 57 for rad/s, 1000 for mg and mdps.
@@ -286,7 +275,7 @@ class Steps:
     @classmethod
     def of(cls, sensor: str, effects: Sequence[FittedEffect]) -> Self:
         """Divide the given effects of a sensor."""
-        fields = {e.name: fields_used(sensor, [e]) for e in effects}
+        fields = {e.name: measurement.fields_used(sensor, [e]) for e in effects}
         moving = [e for e in effects if fields[e.name] - OF_THE_ROOM]
         return cls([e for e in effects if e not in moving], moving, fields)
 
@@ -297,7 +286,7 @@ class Steps:
 
     def needs(self, effect: str) -> set[str]:
         """Return the signals of a log that an effect needs."""
-        return set().union(*(FIELDS_OF_SIGNALS[field] for field in self.fields[effect]))
+        return set().union(*(measurement.FIELDS_OF_SIGNALS[field] for field in self.fields[effect]))
 
 
 def circular(steps: Mapping[str, Steps]) -> set[str]:
@@ -315,13 +304,13 @@ class CompensationStream:
 
     def __init__(self, unit: str, calibrations: dict[str, SensorCalibration], smoothing: float) -> None:
         self.unit, self.smoothing = unit, smoothing
-        self.steps = {s: Steps.of(s, sensor_effects(c)) for s, c in calibrations.items()}
-        self._steady = {s: SensorEffects.of(c, self.steps[s].steady) for s, c in calibrations.items()}
-        self._moving = {s: SensorEffects.of(c, self.steps[s].moving) for s, c in calibrations.items()}
-        self._linear = {s: SensorEffects.of(c, ()) for s, c in calibrations.items()}
-        self._line = ExponentialRegression(smoothing or 1.0)
-        self._slope = ExponentialRegression(max(smoothing, RATE_SMOOTHING_S))
-        self._ends = [LogEnd()]  # of the last block, one for each iteration
+        self.steps = {s: Steps.of(s, measurement.sensor_effects(c)) for s, c in calibrations.items()}
+        self._steady = {s: measurement.SensorEffects.of(c, self.steps[s].steady) for s, c in calibrations.items()}
+        self._moving = {s: measurement.SensorEffects.of(c, self.steps[s].moving) for s, c in calibrations.items()}
+        self._linear = {s: measurement.SensorEffects.of(c, ()) for s, c in calibrations.items()}
+        self._line = measurement.ExponentialRegression(smoothing or 1.0)
+        self._slope = measurement.ExponentialRegression(max(smoothing, RATE_SMOOTHING_S))
+        self._ends = [measurement.LogEnd()]  # of the last block, one for each iteration
 
     @property
     def needs(self) -> set[str]:
@@ -359,7 +348,7 @@ class CompensationStream:
         shaped = {s: value[0] if single else value for s, value in found.items()}
         return Compensated(shaped.get("accelerometer"), shaped.get("gyroscope"))
 
-    def _block(self, arrays: Mapping[str, Values]) -> Truths:
+    def _block(self, arrays: Mapping[str, Values]) -> measurement.Truths:
         """Return the truth of each sensor in a block of samples."""
         readings = {s: arrays[s] for s in SENSORS if s in arrays}
         steps = {s: self.steps[s] for s in readings if s in self.steps}
@@ -371,39 +360,45 @@ class CompensationStream:
         warming = None
         if warm is not None and "temperature_rate" in used:
             warming = self._slope.apply(clock, warm, slope=True)
-        motion_of = partial(log_motion, clock, temperature=warm, temperature_rate=warming)
+        motion_of = partial(measurement.log_motion, clock, temperature=warm, temperature_rate=warming)
 
-        def true_motion(truths: Truths, number: int) -> Motion:
+        def true_motion(truths: measurement.Truths, number: int) -> Motion:
             force, rate = truths.get("accelerometer", zeros), truths.get("gyroscope", zeros)
             end = self._ends[min(number, len(self._ends) - 1)]
             return motion_of(specific_force=force, angular_rate=rate, used=used, end=end)
 
         if any(step.steady for step in steps.values()):
-            room = motion_of(specific_force=zeros, angular_rate=zeros, used=set(), end=LogEnd())
+            room = motion_of(specific_force=zeros, angular_rate=zeros, used=set(), end=measurement.LogEnd())
             readings |= {s: self._steady[s].take_off(readings[s], room) for s in steps}
         return self._solved(steps, readings, true_motion, used & OF_THE_PAST)
 
     def _solved(
-        self, steps: dict[str, Steps], readings: Truths, true_motion: Callable[[Truths, int], Motion], past: set[str]
-    ) -> Truths:
+        self,
+        steps: dict[str, Steps],
+        readings: measurement.Truths,
+        true_motion: Callable[[measurement.Truths, int], Motion],
+        past: set[str],
+    ) -> measurement.Truths:
         """Subtract the effects that depend on the truth; store the end of the block for each iteration."""
         turns = circular(steps)
         once = {s: self._moving[s] for s, step in steps.items() if step.moving and s not in turns}
-        ends: list[LogEnd] = []
+        ends: list[measurement.LogEnd] = []
 
-        def motion_of(truths: Truths, number: int) -> Motion:
+        def motion_of(truths: measurement.Truths, number: int) -> Motion:
             motion = true_motion(truths, number)
             if past:
                 ends.append(self._ends[min(number, len(self._ends) - 1)].after(motion, past))
             return motion
 
-        truths = solve({s: self._moving[s] if s in turns else self._linear[s] for s in steps}, readings, motion_of)
+        truths = measurement.solve(
+            {s: self._moving[s] if s in turns else self._linear[s] for s in steps}, readings, motion_of
+        )
         settled = len(ends)
         for iteration in range(settled, max(settled + 1, len(self._ends)) if turns and past else settled):
             motion_of(truths, iteration)
         if once:
             motion = true_motion(truths, len(self._ends)) if turns else motion_of(truths, 0)
-            truths |= without_effects(once, readings, motion)
+            truths |= measurement.without_effects(once, readings, motion)
         self._ends = ends or self._ends
         return truths
 
@@ -450,21 +445,10 @@ class Compensation:
     ) -> Compensated:
         """Return the calibrated readings of a log, or of a single sample, in the shapes that were given.
 
-        Parameters
-        ----------
-        accelerometer : (n, 3) or (3,) array, g, optional
-        gyroscope : (n, 3) or (3,) array, deg/s, optional
-        temperature : (n,) array or float, degC, optional
-            Needed where a fitted effect depends on it.
-        time : (n,) array or float, s since power-on, optional
-            Likewise; also with it the temperature is smoothed, causally.
-        smoothing : float, s
-            Memory of the temperature's smoothing (``pipeline.physics.measurement``); 0: none.
-
-        Raises
-        ------
-        InputError
-            If neither sensor is given, shapes do not match, or an effect needs a signal that is not given.
+        ``accelerometer``: (n, 3) or (3,), g; ``gyroscope``: the same, deg/s. ``temperature``: (n,) or a float, degC, if
+        a fitted effect needs it. ``time``: (n,) or a float, s since power-on, likewise; with it the temperature is
+        smoothed, causally, with the memory ``smoothing``, s (``pipeline.physics.measurement``); 0: none. Raises
+        ``InputError`` if neither sensor is given, shapes do not match, or an effect needs a signal that is not given.
         """
         return self.stream(smoothing).apply(accelerometer, gyroscope, temperature, time)
 

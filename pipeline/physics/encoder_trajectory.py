@@ -51,25 +51,16 @@ class Pieces(NamedTuple):
 class EncoderTrajectory:
     """Angle, rate and acceleration at any time, interpolated from a log.
 
-    Parameters
-    ----------
-    time, angle, rate : (n,) array, s, deg, deg/s
-        At least 6 samples.
-    rate_logged : bool
-        Whether the table logs the rate; False: it was computed from the angle.
+    ``time, angle, rate``: (n,) arrays, s, deg, deg/s, of at least 6 samples. ``rate_logged``: whether the table logs
+    the rate; False: it was computed from the angle. Attributes:
 
-    Attributes
-    ----------
-    explained : (n - 1,) array of bool
-        Intervals that one or two stretches of constant acceleration reproduce.
-    valid : (n - 1,) array of bool
-        Explained intervals, and intervals of smooth motion: ``dA = (r_0 + r_1) dt / 2 - (r'_1 - r'_0) dt^2 / 12`` to
-        1e-3 deg, to the noise of the log, or to its rounding. In other intervals the trajectory is not reliable.
-    valid_samples : (n,) array of bool
-        Samples followed by a valid interval, with only valid intervals in the 0.3 s before them, in which a filter
-        inside the sensor settles. Samples at which a stretch ends are not valid.
-    acceleration : (n,) array, deg/s^2
-        At the samples.
+    ``explained``: (n - 1,) bool, intervals that one or two stretches of constant acceleration reproduce.
+    ``valid``: (n - 1,) bool, explained intervals, and intervals of smooth motion: ``dA = (r_0 + r_1) dt / 2 -
+    (r'_1 - r'_0) dt^2 / 12`` to 1e-3 deg, to the noise of the log, or to its rounding. In other intervals the
+    trajectory is not reliable.
+    ``valid_samples``: (n,) bool, samples followed by a valid interval, with only valid intervals in the 0.3 s before
+    them, in which a filter inside the sensor settles. Samples at which a stretch ends are not valid.
+    ``acceleration``: (n,), deg/s^2, at the samples.
     """
 
     def __init__(self, time: Values, angle: Values, rate: Values, *, rate_logged: bool = True) -> None:

@@ -64,7 +64,6 @@ class Signal(NamedTuple):
 
 
 def _vector(prefix: str, field: str, meaning: str, c: str) -> dict[str, Signal]:
-    """Return the three components of a vector."""
     return {
         f"{prefix}{a}": Signal(meaning.format(axis=f"body {a}"), field, (i,), c.format(i)) for i, a in enumerate("xyz")
     }

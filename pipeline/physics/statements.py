@@ -101,9 +101,8 @@ OF_FRAME = "the angles between the calibrated axes and the case"
 NO_FRAME = "how the case lies to turn axes, faces and zeros is not stated (table.seat_deg, procedure.faces)"
 OF_EFFECT = "another effect that looks alike, or an error of the table, its log or the time stamps"
 Entry = dict[str, Any]
-LimitRow = tuple[
-    str, float, float, str, float, float, str
-]  # name, value, uncertainty, unit, limit, floor, likely cause
+# name, value, uncertainty, unit, limit, floor, likely cause
+LimitRow = tuple[str, float, float, str, float, float, str]
 
 
 def with_open(

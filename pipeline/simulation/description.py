@@ -327,9 +327,8 @@ class TableLog(Described):
 
     PART: ClassVar[str] = "table_log"
 
-    kind: Literal["rows", "file", "program"] = (
-        "rows"  # rows: in the sensor's rows; file: in a separate file; program: not at all
-    )
+    # rows: in the sensor's rows; file: in a separate file; program: not at all
+    kind: Literal["rows", "file", "program"] = "rows"
     interval_s: Positive = 0.01  # of a file
     offset_s: float | None = None  # of the file's clock; None: at random, 0 to 100 s
     drift_ppm: float | None = None  # of the file's clock; None: at random, standard deviation 50 ppm
@@ -456,7 +455,6 @@ def description_from(data: dict[str, Any], origin: str) -> Description:
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:
-    """Read a YAML file that holds a mapping."""
     if not os.path.lexists(path):
         raise MissingInputError("this file does not exist", str(path))
     data = read_yaml(path)

@@ -253,8 +253,7 @@ def drawn_sensors(
         noise = {key: given[sensor][key] for key in NOISE_KEYS & set(given[sensor])}
         data_sheet = sensor_model.of(sensor).replaced(**noise)
         of_sensor = {name: hidden for name, hidden in effects[sensor].items() if name not in ALTERATIONS}
-        drawn = _limited(data_sheet.bias, rng)
-        bias = np.array(given[sensor].get("bias", drawn), float)
+        bias = np.array(given[sensor].get("bias", _limited(data_sheet.bias, rng)), float)
         out[sensor] = SimulatedSensor(
             sensor, data_sheet, bias, _matrix(data_sheet, given[sensor], mounting, rng), of_sensor
         )

@@ -61,7 +61,6 @@ from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, dia
 from pipeline.evaluation.diagnosis.verdict import (
     EXPLAINED,
     MAX_UNKNOWN_PROBABILITY,
-    HeldOutError,
     VerdictInput,
     judged,
     may_be_unknown,
@@ -69,7 +68,7 @@ from pipeline.evaluation.diagnosis.verdict import (
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.evaluation.held_out.error_breakdown import last_step, vector_errors
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, samples_of_motion
-from pipeline.evaluation.held_out.validation import last_error, static_error
+from pipeline.evaluation.held_out.validation import HeldOutError, last_error, static_error
 from pipeline.physics.effects import catalogue, effect, effect_of
 from pipeline.physics.effects.base import parameter_limits, truth, unit_of
 from pipeline.physics.kinematics import EARTH_RATE_DPS
@@ -81,12 +80,8 @@ OTHER_FILE = "check that the sensor's file is that of this unit, and that its ra
 # an accelerometer whose mountings may be wrong
 IN_DOUBT = Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED
 LEANING = ("mounting", "table_axis_nonorthogonality")  # effects that tilt a turn axis in the body
-ERRORS_OUTSIDE_UNCERTAINTY = (
-    "bias",
-    "scale_factor",
-    "non_orthogonality",
-    "rotation",
-)  # errors of a method that its uncertainty excludes
+# errors of a method that its uncertainty excludes
+ERRORS_OUTSIDE_UNCERTAINTY = ("bias", "scale_factor", "non_orthogonality", "rotation")
 AVERAGING_TIMES_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position
 MIN_STRETCHES = 8  # stretches, which determine a standard deviation to a quarter
 
@@ -149,18 +144,13 @@ def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
         if span < resolution:
             return f"the temperature changes by {span:.2g} degC, less than its resolution of {resolution:.2g} degC"
     used = [r for r in case.recordings if r.reading(case.sensor) is not None]
-    density = sheet.stated("noise_density") if _shows_its_own_noise(case) else None
-    if density is not None and case.noise is not None and case.noise.step is None and used:
-        excess = float(np.min(case.noise.white)) / (density * float(np.sqrt(0.5 / used[0].interval)))
+    noise, density = case.noise, sheet.stated("noise_density")
+    if density is not None and noise is not None and noise.step is None and used:
+        own = noise.source == "static" or (noise.source == "rests" and is_multi_position(case.sensor, case.recordings))
+        excess = float(np.min(noise.white)) / (density * float(np.sqrt(0.5 / used[0].interval))) if own else 0.0
         if excess > TIMES_POSSIBLE:
             return f"the noise is {excess:.2g} times the sensor file's, so that the file is not that of this sensor"
     return ""
-
-
-def _shows_its_own_noise(case: DiagnosisInput) -> bool:
-    """Return whether the noise is that of a static recording, or of rests by hand."""
-    source = "" if case.noise is None else case.noise.source
-    return source == "static" or (source == "rests" and is_multi_position(case.sensor, case.recordings))
 
 
 def _temperatures(recordings: list[Recording]) -> tuple[float, float]:
@@ -274,10 +264,9 @@ def evidence_of(
             return None
         try:
             held_out = HeldOutCase(fit(), recordings, case.noise, settings, findings.other)
-            error = last_error(held_out, held_out.held_out_samples(smoothed=smoothed))
+            return last_error(held_out, held_out.held_out_samples(smoothed=smoothed))
         except ConvergenceError:  # the fit's effects cannot be subtracted from the held-out readings
             return None
-        return None if error is None else HeldOutError(error[0], *error[1])
 
     static = None
     if case.noise is not None:
@@ -293,7 +282,7 @@ def evidence_of(
         found.residual_over_noise,
         findings.left_over_noise if findings else None,
         published=published,
-        static=HeldOutError(static[0], *static[1]) if static else None,
+        static=static,
         agreement=validation.agreement if validation else None,
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,
@@ -424,7 +413,8 @@ def effective_noise(
     held_out = [r for r in recordings if r.role == "validation"]
     of_motion = ((r, samples_of_motion(calibration.sensor, r, noise, table, other=other)) for r in held_out)
     samples = [(r, s) for r, s in of_motion if s is not None]
-    errors = [(r, (s.time, e)) for r, s in samples if (e := _error(calibration, s)) is not None]
+    last = [(r, s, last_step(calibration, s)) for r, s in samples]
+    errors = [(r, (s.time, vector_errors([e], directed=e[2] is not None))) for r, s, e in last if e is not None]
     if not errors:
         return None
     of_effects = {}
@@ -453,12 +443,6 @@ def effective_noise(
         "white": white,
         "densities": densities,
     }
-
-
-def _error(calibration: SensorCalibration, samples: Samples) -> Values | None:
-    """Return the error of calibrated readings, (n, 3), or of their magnitude, (n, 1); None if an effect is left out."""
-    corrected = last_step(calibration, samples)
-    return None if corrected is None else vector_errors([corrected], directed=corrected[2] is not None)
 
 
 def _of_effect(calibration: SensorCalibration, samples: Samples, found: SensorDiagnosis, name: str) -> Values | None:

@@ -76,8 +76,7 @@ def method_errors(
         "held_out_magnitude_share": _shares({name: _rms(error) for name, (_, error) in of_held_out.items()}),
     }
     rms = {name: _rms(error) for name, (error, _) in of_turns.items()}
-    printed = settings.method.as_printed
-    return _named(difference, rms, recordings, selection.names, shares, printed=printed)
+    return _named(difference, rms, recordings, selection.names, shares, printed=settings.method.as_printed)
 
 
 def given_differences(
@@ -201,7 +200,6 @@ def _shares(rms: Mapping[str, float]) -> dict[str, float]:
 
 
 def _rms(errors: Values) -> float:
-    """Return the rms of errors of (n, 3) vectors or (n,) magnitudes."""
     return float(np.sqrt(np.sum(errors**2) / len(errors)))
 
 

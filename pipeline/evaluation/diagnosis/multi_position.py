@@ -33,15 +33,7 @@ from pipeline.estimation.effects import model_of
 from pipeline.estimation.engine import ScaledColumns, cholesky
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
 from pipeline.estimation.harm import REST_FOLDS, LeftOut, left_out, rests_in_turn
-from pipeline.estimation.multi_position.fit import (
-    CEILING_TO,
-    COMPARED_STEP,
-    MIN_NEW_NORM_SHARE,
-    FitByHand,
-    judged_curves,
-    log_likelihoods,
-    project_out,
-)
+from pipeline.estimation.multi_position import fit as fitting
 from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis
 from pipeline.estimation.multi_position.result import calibration_of
 from pipeline.estimation.multi_position.selection import SelectionByHand, is_hysteresis, loops_of, posterior
@@ -80,17 +72,20 @@ def findings(case: DiagnosisInput) -> Findings:
         expected = replace(expected, bias=Setting(ratio, noise.correlation_time))
     with_scatter = replace(expected, scatter=selection.fits[-1].noise.scatter)
     hidden, unknown = not_observable_by_hand(selection, case.modelled), _dependences(selection)
-    chi = [float(np.sum(project_out(fit.equations, [with_scatter]).residual ** 2)) for fit in selection.fits]
+    chi = [float(np.sum(fitting.project_out(fit.equations, [with_scatter]).residual ** 2)) for fit in selection.fits]
     moving = with_scatter if "slow" in model.rests.kinds else expected  # its accelerations are no missing effect
     over, left_over = (_over_noise(model, selection.fits[k].equations, moving) for k in (0, -1))
     verdict = verdict_of_selection_by_hand(selection.names, unknown, left_over)
-    scores = log_likelihoods(selection.fits[-1].equations, selection.hypotheses)
+    scores = fitting.log_likelihoods(selection.fits[-1].equations, selection.hypotheses)
     best = selection.hypotheses[int(np.argmax(scores))]
-    signal, folds = selection.first.signal, _folds(selection, lambda part: SelectionByHand(part, *given, COMPARED_STEP))
+    signal, folds = (
+        selection.first.signal,
+        _folds(selection, lambda part: SelectionByHand(part, *given, fitting.COMPARED_STEP)),
+    )
 
     held_out = _held_out(selection, folds)
 
-    def calibrated(fit: FitByHand) -> SensorCalibration:
+    def calibrated(fit: fitting.FitByHand) -> SensorCalibration:
         return calibration_of(model, fit, calibration, case.settings)
 
     def advice(verdict: Verdict) -> str:
@@ -201,8 +196,7 @@ def _without_creep(case: DiagnosisInput) -> Noise | None:
     if noise is None or noise.source == "static":
         return noise
     wander = np.full(3, data_sheet.bias_wander)
-    time = data_sheet.wander_time_s
-    return replace(noise, wander=wander, correlation_time=time)
+    return replace(noise, wander=wander, correlation_time=data_sheet.wander_time_s)
 
 
 def _shares(selection: SelectionByHand, name: str) -> dict[str, float]:
@@ -222,7 +216,7 @@ def _over_noise(model: Model, equations: Equations, expected: NoiseHypothesis) -
     L = cholesky(equations.covariance(expected)[rests, rests])
     columns = np.asarray(np.linalg.solve(L, equations.columns[rests]), np.float64)
     readings = np.asarray(np.linalg.solve(L, equations.residual[rests]), np.float64)
-    factors = ScaledColumns.of(columns, MIN_NEW_NORM_SHARE)
+    factors = ScaledColumns.of(columns, fitting.MIN_NEW_NORM_SHARE)
     residual, freedom = readings - columns @ factors.solve(readings), len(readings) - factors.rank
     return float(np.sqrt(residual @ residual / freedom)) if freedom > 0 else None
 
@@ -233,7 +227,7 @@ def _held_out(selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand,
         squares = [selection.model.held_out_squares(each.state) for each in selection.fits]
         return LeftOut(squares, judged=[bool(selection.names) and len(squares[0]) > 0] * len(squares))
 
-    def known(k: int, count: int) -> FitByHand | None:
+    def known(k: int, count: int) -> fitting.FitByHand | None:
         same = folds[k][0].names[:count] == selection.names[:count]
         return folds[k][0].fits[count] if same else None
 
@@ -311,21 +305,21 @@ def _dependences(selection: SelectionByHand) -> list[Dependence]:
     loops = loops_of(model, state.terms)
     tests += [(HYSTERESIS, ())] if loops else []
     equations = model.equations(state, [*curves, *loops])
-    possible = selection.ceilings > selection.fits[-1].log_likelihood - CEILING_TO
+    possible = selection.ceilings > selection.fits[-1].log_likelihood - fitting.CEILING_TO
     hypotheses = [selection.hypotheses[i] for i in np.flatnonzero(possible)]
 
     def dependences(judged: Sequence[tuple[float, float]]) -> list[Dependence]:
         results = [(test, *found) for (test, _), found in zip(tests, judged, strict=False)]
         return [Dependence(name, p) for name, (_, p) in significant(results).items()]
 
-    judged = judged_curves(equations, hypotheses)
+    judged = fitting.judged_curves(equations, hypotheses)
     found = dependences(judged)
     if HYSTERESIS not in [each.covariate for each in found]:
         return found
     if not is_hysteresis(judged[-2:]):
         *others, _, lag = equations.candidates
         given = replace(equations, effects=[*equations.effects, lag], candidates=others)
-        return dependences(judged_curves(given, hypotheses))
+        return dependences(fitting.judged_curves(given, hypotheses))
     return found[:1] if found[0].covariate == HYSTERESIS else found
 
 

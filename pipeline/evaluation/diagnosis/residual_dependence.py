@@ -70,11 +70,8 @@ STEP_POSITIONS = 16  # of steps: the nearest one is within 1/32 of the span
 # of the gain by effects of time or temperature: less may be the error of a smoothed temperature
 MAX_SHARE_OF_LINEARISATION = 0.05
 RESIDUAL_OVER_NOISE = 1.1  # times the white noise: a larger residual may contain a step
-SIGNAL_OF_COVARIATE = {
-    "time": "time",
-    "temperature": "temperature",
-    "rate": "speed",
-}  # of covariates, for steps and polynomials
+# of covariates, for steps and polynomials
+SIGNAL_OF_COVARIATE = {"time": "time", "temperature": "temperature", "rate": "speed"}
 SIMULATIONS = 199  # standard error of the share: 3.5 % at most
 OWN_BASE_COLUMNS = 4  # columns of the base on each axis
 RANK_OF_RESTS = 1e-8  # of singular values: columns that are the same to rounding

@@ -14,6 +14,7 @@ from pipeline.core.records import Agreement, Dependence, MovesError, SelectionEr
 from pipeline.core.verdicts import MARK_AFTER_MOVES, Verdict, decided_words
 from pipeline.estimation.stages import FitStage
 from pipeline.evaluation.diagnosis.words import listed, of_unknown, plain, template
+from pipeline.evaluation.held_out.validation import HeldOutError
 from pipeline.physics.effects import catalogue
 from pipeline.physics.effects.base import unit_of
 
@@ -63,25 +64,6 @@ RULES: tuple[tuple[Verdict, str, Callable[[VerdictInput], object]], ...] = (
 
 
 @dataclass(frozen=True)
-class HeldOutError:
-    """A held-out rms error and the interval in which it is expected, g or deg/s."""
-
-    error: float
-    low: float
-    high: float
-
-    @property
-    def above(self) -> bool:
-        """Whether the error is larger than noise and stated uncertainties explain."""
-        return self.error > self.high
-
-    @property
-    def below(self) -> bool:
-        """Whether the error is smaller than the noise estimate explains."""
-        return self.error < self.low
-
-
-@dataclass(frozen=True)
 class VerdictInput:
     """The evidence for the verdict on a sensor."""
 
@@ -94,16 +76,14 @@ class VerdictInput:
     published: HeldOutError | None = None  # of the unit's calibration
     moves: MovesError | None = None  # of held-out moves by hand
     scatter: float = 0.0  # of moves or directions by hand that the fit found, over the noise
-    free: HeldOutError | None = (
-        None  # of a free fit of the same recordings; filtered ones against the filtered reference
-    )
+    # of a free fit of the same recordings; filtered ones against the filtered reference
+    free: HeldOutError | None = None
     full: HeldOutError | None = None  # of the free fit with the selected effects
     agreement: Agreement | None = None
     static: HeldOutError | None = None  # mean of the static recording, by the unit's calibration
     doubts: Sequence[str] = ()  # contradictions of the reference, from the checks of the recordings
-    approximations: Sequence[
-        str
-    ] = ()  # errors of the method's bias and matrix (``pipeline.evaluation.diagnosis.method_errors``)
+    # errors of the method's bias and matrix (``pipeline.evaluation.diagnosis.method_errors``)
+    approximations: Sequence[str] = ()
     unknown: Sequence[str] = ()  # covariates on which the residual with the selected effects depends
     beyond: Sequence[str] = ()  # covariates of physics that is likely and outside the catalogue
     implausible: Sequence[str] = ()  # selected effects beyond the sensor's limits, unless the settings accept that

@@ -374,8 +374,7 @@ def expected_rms_error(
     if form.cumulants(np.ones((4, 1)))[0, 0] <= 0.0:
         return 0.0, 0.0
     observed_s = noise.length + (fitted_s if residual_wander is not None else 0.0)
-    nu = form.freedom(freedom)
-    factors = [_factors(nu, noise, observed_s, upper=upper) for upper in (False, True)]
+    factors = [_factors(form.freedom(freedom), noise, observed_s, upper=upper) for upper in (False, True)]
     low, high = (_quantile(form, *f, p) for f, p in zip(factors, (TAIL, 1.0 - TAIL), strict=True))
     return float(np.sqrt(low)), float(np.sqrt(high))
 

@@ -40,7 +40,7 @@ bias of a fit without them does.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -68,18 +68,7 @@ from pipeline.estimation.accelerometer.nonlinear_least_squares import PARAMETER_
 from pipeline.estimation.rest_means import count_of_rests
 from pipeline.estimation.stages import StageInput
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
-from pipeline.evaluation.held_out.error_breakdown import (
-    LinearizedSamples,
-    direction_known,
-    error_breakdown,
-    expected_rms_error,
-    last_error_of_magnitude,
-    last_step,
-    left_out,
-    linearized,
-    rms_error_of,
-    with_known_effects,
-)
+from pipeline.evaluation.held_out import error_breakdown as breakdown
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, reference_vector, squared_norm_errors
 from pipeline.ingest.quality_flags import STUCK
 from pipeline.physics.effects import bench_priors, effect_of, owner_of
@@ -114,6 +103,25 @@ OF_MATRIX = {"temperature", "angular_rate"}  # signals of an effect that changes
 AT_REST_TOO = {"time", "temperature", "specific_force"}  # signals
 
 
+@dataclass(frozen=True)
+class HeldOutError:
+    """A held-out rms error and the interval in which it is expected, g or deg/s."""
+
+    error: float
+    low: float
+    high: float
+
+    @property
+    def above(self) -> bool:
+        """Whether the error is larger than noise and stated uncertainties explain."""
+        return self.error > self.high
+
+    @property
+    def below(self) -> bool:
+        """Whether the error is smaller than the noise estimate explains."""
+        return self.error < self.low
+
+
 def validate(
     calibration: SensorCalibration,
     recordings: Sequence[Recording],
@@ -143,7 +151,7 @@ def validate(
         steps=(StepErrors("raw"), StepErrors("calibrated")),
     )
     if count:
-        steps, notes = error_breakdown(calibration, samples)
+        steps, notes = breakdown.error_breakdown(calibration, samples)
         floor, vector_floor = noise_floors(calibration, samples)
         part = replace(
             part,
@@ -153,7 +161,7 @@ def validate(
             steps=tuple(steps),
             over_temperature=_over_temperature(case, samples, held_out=part.held_out),
         )
-        parts = [linearized(calibration, s) for s in samples if s.known.any()]
+        parts = [breakdown.linearized(calibration, s) for s in samples if s.known.any()]
         complete = [p for p in parts if p is not None]
         if len(complete) == len(parts):
             expected = _expected(case, samples, complete)
@@ -163,7 +171,7 @@ def validate(
                 agreement = _agreement(case, samples, complete)
                 part = replace(part, agreement=agreement, worse_than_raw=_worse_than_raw(case, samples, expected[1]))
         else:
-            names = left_out(calibration, samples)
+            names = breakdown.left_out(calibration, samples)
             verb = "is" if len(names) == 1 else "are"
             notes.append(
                 f"the expected error is not stated, because {', '.join(names)} {verb} left out of the held-out error"
@@ -175,8 +183,11 @@ def validate(
 def _over_temperature(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) -> OverTemperature | None:
     """Return the errors over temperature, of the fit's samples if the held-out ones (``held_out``) sweep none."""
     bins, of_fit = residuals_over_temperature(case.calibration, samples), not held_out
-    if bins is None and held_out and _is_swept(case.recordings):
-        bins, of_fit = residuals_over_temperature(case.calibration, case.fit_samples()), True
+    if bins is None and held_out:
+        warmth = np.concatenate([np.zeros(0), *(r.temperature for r in case.recordings if r.temperature is not None)])
+        warmth = warmth[np.isfinite(warmth)]
+        if len(warmth) and np.ptp(warmth) >= SWEEP_DEGC:
+            bins, of_fit = residuals_over_temperature(case.calibration, case.fit_samples()), True
     return (
         OverTemperature("the samples of the fit" if of_fit else "the held-out samples", tuple(bins)) if bins else None
     )
@@ -192,7 +203,7 @@ def residuals_over_temperature(
     """
     temperatures, errors = [np.zeros(0)], [np.zeros(0)]
     for each in samples:
-        error = last_error_of_magnitude(calibration, each)
+        error = breakdown.last_error_of_magnitude(calibration, each)
         if error is None or each.temperature is None:
             return None
         known = each.known & np.isfinite(error) & np.isfinite(each.temperature)
@@ -207,14 +218,9 @@ def residuals_over_temperature(
     return [TemperatureBin(float(w.mean()), float(e.mean()), float(np.sqrt(np.mean(e**2))), len(e)) for w, e in parts]
 
 
-def _is_swept(recordings: Sequence[Recording]) -> bool:
-    """Return whether the temperatures of all recordings together span ``SWEEP_DEGC``."""
-    warmth = np.concatenate([np.zeros(0), *(r.temperature for r in recordings if r.temperature is not None)])
-    warmth = warmth[np.isfinite(warmth)]
-    return len(warmth) > 0 and bool(np.ptp(warmth) >= SWEEP_DEGC)
-
-
-def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> tuple[float, float]:
+def _expected(
+    case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[breakdown.LinearizedSamples]
+) -> tuple[float, float]:
     """Return the interval of the last step's rms error; ``parts``: the samples with their derivatives.
 
     Earth's rotation, where it is left out of a magnitude, changes the rms error by its rate at most.
@@ -222,12 +228,12 @@ def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[Lin
     sensor = case.calibration.sensor
     fitted = [r for r in case.recordings if r.role in {sensor, "rests"} and r.samples and r.reading(sensor) is not None]
     fitted_s = sum(float(r.time[-1] - r.time[0]) for r in fitted)
-    low, high = expected_rms_error(case.calibration, parts, case.noise, case.settings, fitted_s)
+    low, high = breakdown.expected_rms_error(case.calibration, parts, case.noise, case.settings, fitted_s)
     earth = EARTH_RATE_DPS if any(s.earth_left_out for s in samples) else 0.0
     return max(low - earth, 0.0), high + earth
 
 
-def static_error(case: HeldOutCase) -> tuple[float, tuple[float, float]] | None:
+def static_error(case: HeldOutCase) -> HeldOutError | None:
     """Return the error of the mean of the static recording, and its interval as a held-out rest; None without one.
 
     The heading is unknown, so Earth's rotation widens the interval of a gyroscope twice: its component in the bias, and
@@ -235,25 +241,26 @@ def static_error(case: HeldOutCase) -> tuple[float, tuple[float, float]] | None:
     """
     static = {r.name: [Rest(0, r.samples)] for r in case.recordings if r.role == "static" and r.samples}
     judged = last_error(case, [s for s in case.at_rests(static) if s.known.any()])
-    if judged is None:
-        return None
-    error, (low, high) = judged
-    turning = 2.0 * EARTH_RATE_DPS if case.calibration.sensor == "gyroscope" else 0.0
-    return error, (max(low - turning, 0.0), high + turning)
+    if judged is None or case.calibration.sensor == "accelerometer":
+        return judged
+    turning = 2.0 * EARTH_RATE_DPS
+    return replace(judged, low=max(judged.low - turning, 0.0), high=judged.high + turning)
 
 
-def last_error(case: HeldOutCase, samples: Sequence[Samples]) -> tuple[float, tuple[float, float]] | None:
+def last_error(case: HeldOutCase, samples: Sequence[Samples]) -> HeldOutError | None:
     """Return the rms error of samples after the last step and its interval; None without samples or interval."""
-    errors = [last_error_of_magnitude(case.calibration, s) for s in samples]
-    parts = [linearized(case.calibration, s) for s in samples if s.known.any()]
+    errors = [breakdown.last_error_of_magnitude(case.calibration, s) for s in samples]
+    parts = [breakdown.linearized(case.calibration, s) for s in samples if s.known.any()]
     complete = [p for p in parts if p is not None]
     if not complete or len(complete) < len(parts):
         return None
     error = np.concatenate([e for e in errors if e is not None])
-    return float(np.sqrt(np.nanmean(error**2))), _expected(case, samples, complete)
+    return HeldOutError(float(np.sqrt(np.nanmean(error**2))), *_expected(case, samples, complete))
 
 
-def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> Agreement | None:
+def _agreement(
+    case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[breakdown.LinearizedSamples]
+) -> Agreement | None:
     """Return how the matrix agrees with held-out motion.
 
     None where no held-out motion has a vector reference, the method fixes elements of the matrix, a filter was applied,
@@ -272,8 +279,8 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
         return None
     calibrated, slopes = [], np.zeros((9, len(calibration.covariance)))
     for recording, samples, part in zip(recordings, held_out, parts, strict=True):
-        found = last_step(calibration, samples)
-        if found is None or found[2] is None or not direction_known(calibration, samples):
+        found = breakdown.last_step(calibration, samples)
+        if found is None or found[2] is None or not breakdown.direction_known(calibration, samples):
             return None
         reading, truth = found[0], found[2]
         known = samples.known & np.isfinite(np.hstack([reading, truth])).all(axis=1)
@@ -315,7 +322,7 @@ def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> 
         for s in samples
     ]
     floor = float(np.sqrt(np.mean(np.concatenate(squares))))
-    if not all(direction_known(calibration, s) for s in samples):
+    if not all(breakdown.direction_known(calibration, s) for s in samples):
         return floor, None
     vectors = np.concatenate([(s.variance @ np.sum(calibration.matrix**2, axis=0))[s.known] for s in samples])
     return floor, float(np.sqrt(np.mean(vectors)))
@@ -347,7 +354,7 @@ def _fitted_exactly(calibration: SensorCalibration) -> int:
 
 def _worse_than_raw(case: HeldOutCase, samples: Sequence[Samples], allowed: float) -> str | None:
     """Return why a calibration must not be used, as one sentence; None where it may be used."""
-    errors = [last_error_of_magnitude(case.calibration, s) for s in samples]
+    errors = [breakdown.last_error_of_magnitude(case.calibration, s) for s in samples]
     after = [error[s.known] for error, s in zip(errors, samples, strict=True) if error is not None]
     if len(after) < len(samples):
         return None
@@ -388,8 +395,7 @@ def _check_limits(calibration: SensorCalibration, last: StepErrors, limits: Sens
     for name, value in figures.items():
         limit: float | None = getattr(limits, name)
         if limit is not None:
-            passes = value is not None and bool(value <= limit)
-            checks.append(LimitCheck(name, limit, value, passes))
+            checks.append(LimitCheck(name, limit, value, value is not None and bool(value <= limit)))
     return tuple(checks)
 
 
@@ -422,14 +428,14 @@ def reduced(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) ->
         left = truth if partial.effects == calibration.effects else _calibrated(partial, fitted)
         bias, matrix = _fitted(calibration if kept >= sloping else at_mean, part, left, truth)
         partial = replace(partial, effects=effects)
-        error = rms_error_of(replace(partial, bias=bias, matrix=matrix), samples)
+        error = breakdown.rms_error_of(replace(partial, bias=bias, matrix=matrix), samples)
         found[part, kept] = Reduced(part, sorted(kept), bias.tolist(), matrix.tolist(), error)
     return list(found.values())
 
 
 def _calibrated(calibration: SensorCalibration, samples: Sequence[Samples]) -> Values:
     """Return calibrated readings at samples that represent the recordings: (n, 3) array."""
-    return np.concatenate([with_known_effects(calibration, s)[0][s.representative] for s in samples])
+    return np.concatenate([breakdown.with_known_effects(calibration, s)[0][s.representative] for s in samples])
 
 
 def _at_mean_temperature(

@@ -90,7 +90,6 @@ class _Texts(FileSystemLoader):
     """The texts of templates, for formats those below their declaration."""
 
     def get_source(self, environment: Environment, template: str) -> tuple[str, str, Callable[[], bool]]:
-        """Return text, file and whether it is unchanged."""
         text, file, unchanged = super().get_source(environment, template)
         return text.partition(END_OF_HEADER)[2] if template.endswith(".j2") else text, file, unchanged
 

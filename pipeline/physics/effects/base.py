@@ -125,17 +125,14 @@ class Effect(abc.ABC):
 
     def of_recordings(self, setups: Mapping[str, str]) -> Effect:
         """Return the effect with its parameters for these recordings (name to setup); most have one set for all."""
-        del setups
         return self
 
     def moved(self, motion: Motion, values: Values) -> Motion:
         """Return the motion that acts on the sensor at the time stamps; only effects of timing change it."""
-        del values
         return motion
 
     def slope(self, sensor: str, moved: Motion) -> Values | None:
         """Return du/dp of an effect of timing with one parameter p, from the moved motion; None for other effects."""
-        del sensor, moved
         return None
 
     @property
@@ -173,12 +170,10 @@ class Effect(abc.ABC):
 
     def in_c(self, values: Values) -> list[str] | None:
         """Return a C expression for each axis, in the names of ``calibration.h``; None if there is none."""
-        del values
         return None
 
     def limits(self, sensor: str) -> dict[str, float]:
         """Return the largest plausible sizes by the effect's file, with the keys of the sensor file."""
-        del sensor
         return {}
 
     def available(self, motion: Motion) -> bool:
@@ -198,8 +193,7 @@ def _watched(seen: set[str]) -> Motion:
 
     time, vector = np.arange(2.0), np.ones((2, 3))
     at_rest = (vector, vector, vector, vector, np.full(2, 25.0), time, time, 0, np.ones(2, bool))
-    level = np.tile(np.eye(3), (2, 1, 1))
-    return Watched(time, *at_rest, direction=vector, level=level, temperature_rate=time)
+    return Watched(time, *at_rest, direction=vector, level=np.tile(np.eye(3), (2, 1, 1)), temperature_rate=time)
 
 
 def truth(sensor: str, motion: Motion) -> Values:

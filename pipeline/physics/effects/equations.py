@@ -62,7 +62,6 @@ class TableTilt(DeclaredEffect):
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return K times level y and minus level x in the body frame, times gravity; zeros for the gyroscope."""
-        del values
         assert motion.level is not None  # noqa: S101
         if sensor == "gyroscope":
             return np.zeros((len(motion.time), 3, 2))
@@ -80,7 +79,6 @@ class _OfTurns(DeclaredEffect):
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the columns of the turn axis, zeros for the others."""
-        del values
         out = np.zeros((len(motion.time), 3, 3 * self.each))
         if motion.axis is not None and motion.angle is not None and motion.rate is not None:
             mine = out[:, :, self.each * motion.axis : self.each * (motion.axis + 1)]
@@ -177,7 +175,6 @@ class WarmUp(DeclaredEffect):
 
     def starts(self, sensor: str) -> list[Values]:
         """Return a small grid of time constants."""
-        del sensor
         return [np.array([0.0, 0.0, 0.0, tau]) for tau in STARTS_S]
 
     def stepped(self, values: Values, step: Values) -> Values:
@@ -188,7 +185,6 @@ class WarmUp(DeclaredEffect):
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return ``exp(-t / tau)``."""
-        del sensor, K
         tau = values[3]
         decay = np.exp(-motion.time / tau) if tau > 0 else np.zeros_like(motion.time)
         return np.asarray(decay[:, None])
@@ -287,7 +283,6 @@ class LowPassLag(_Timing):
 
     def starts(self, sensor: str) -> list[Values]:
         """Return a short lag: at 0 its column equals that of a time offset."""
-        del sensor
         return [np.array([START_LAG_S])]
 
     def stepped(self, values: Values, step: Values) -> Values:

@@ -118,7 +118,6 @@ class FormulaEffect(DeclaredEffect):
 
     def fields(self, sensor: str, values: Values) -> set[str]:
         """Return the fields of ``Motion`` that the formulas name."""
-        del values
         return {SIGNALS[signal].field or TRUTHS[sensor] for signal in self._names}
 
     def in_c(self, values: Values) -> list[str]:
@@ -138,7 +137,6 @@ class FormulaEffect(DeclaredEffect):
 
         Raises ``InputError`` if a value is not finite where its signals are finite, or the recording lacks a signal.
         """
-        del values
         signals = {name: self._signal(name, sensor, motion) for name in self._names}
         own, shared = (
             [_value(term, signals, len(motion.time)) for term in terms] for terms in (self._by_axis, self._shared)

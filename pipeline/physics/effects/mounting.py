@@ -105,7 +105,6 @@ class _OfRecordings(DeclaredEffect):
 
     def owner_of(self, recording: str, setup: str) -> str:
         """Return the name under which a recording has parameters: its own."""
-        del setup
         return recording
 
     def covers(self, motion: Motion) -> bool:
@@ -114,7 +113,6 @@ class _OfRecordings(DeclaredEffect):
 
     def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return the parameters of each recording, one recording after the other."""
-        del sensor
         return tuple(
             EffectParameter(f"{name}{suffix}", "deg", f"{self.what}{suffix.replace('_', ' about body ')}, {name}")
             for name in self.recordings
@@ -163,7 +161,6 @@ class Mounting(_OfRecordings):
 
     def rotation(self, motion: Motion, values: Values) -> Values:
         """Return ``exp([theta]x)^T``."""
-        del motion
         return turned_back(values)
 
 
@@ -223,8 +220,6 @@ class _Mounting(Effect):
     source = "rotation of the body frame"
 
     def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
-        """Return theta."""
-        del sensor
         return tuple(EffectParameter(f"theta_{a}", "deg", f"turn of the unit, its part about body {a}") for a in "xyz")
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
@@ -248,12 +243,9 @@ class _Bias(Effect):
     source = "IEEE Std 1554-2005, turn-on to turn-on repeatability"
 
     def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
-        """Return db."""
         return tuple(EffectParameter(f"db_{a}", unit_of(sensor), f"difference of the bias of {a}") for a in "xyz")
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return ones."""
-        del sensor, K, values
         return np.ones((len(motion.time), 1))
 
 
@@ -270,7 +262,6 @@ class _InSession(Effect):
         self.name = name
 
     def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
-        """Return the parameters of the effect."""
         return self.base.parameters(sensor)
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:

@@ -259,8 +259,9 @@ def _at_the_ends(recording: Recording, quiet: Spans) -> list[Rest]:
         source = {**recording.source, RATE_AT_REST: np.mean(means, axis=0).tolist()}
         recording = replace(recording, source=source)
     rests = [Rest(start, stop) for start, stop in quiet]
-    reasons = _rate_reasons(recording, rests)
-    return [replace(r, accepted=not reason, reason=reason) for r, reason in zip(rests, reasons, strict=True)]
+    return [
+        replace(r, accepted=not why, reason=why) for r, why in zip(rests, _rate_reasons(recording, rests), strict=True)
+    ]
 
 
 def _interval(recording: Recording) -> float:
@@ -276,12 +277,9 @@ def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noi
     ``noise_variance``: of the specific force at rest, g^2, summed over the axes.
     """
     rests = [Rest(start, stop) for start, stop in intervals]
-    reasons = [_turn(recording, r) or _scatter(recording, r, noise_variance) for r in rests]
-    rates = _rate_reasons(recording, rests)
-    return [
-        replace(rest, accepted=not reason, reason=reason)
-        for rest, reason in zip(rests, (a or b for a, b in zip(reasons, rates, strict=True)), strict=True)
-    ]
+    pairs = zip(rests, _rate_reasons(recording, rests), strict=True)
+    reasons = [_turn(recording, r) or _scatter(recording, r, noise_variance) or of_rate for r, of_rate in pairs]
+    return [replace(r, accepted=not why, reason=why) for r, why in zip(rests, reasons, strict=True)]
 
 
 def _spoilt(recording: Recording, size: int) -> Mask:
