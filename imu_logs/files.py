@@ -178,15 +178,11 @@ def not_regular(path: Path) -> str:
         return f"is a symbolic link to {path.readlink()}, which does not exist; correct the link or remove it"
     kind = stat.S_IFMT(status.st_mode)
     if kind == stat.S_IFREG:
-        return GIT_LFS if status.st_size < LARGEST_POINTER and _starts_with(POINTER, path) else ""
+        with suppress(PermissionError):
+            if status.st_size < LARGEST_POINTER and path.read_bytes().startswith(POINTER):
+                return GIT_LFS
+        return ""
     return f"is {KINDS.get(kind, 'no regular file')}; a regular file, or a symbolic link to one, is expected"
-
-
-def _starts_with(start: bytes, path: Path) -> bool:
-    """Return whether a file starts with these bytes; False for one without the permission to read it."""
-    with suppress(PermissionError), path.open("rb") as stream:
-        return stream.read(len(start)) == start
-    return False
 
 
 def read_text(path: Path, largest: int, what: str) -> str:

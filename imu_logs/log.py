@@ -133,15 +133,10 @@ def in_house_unit(source: ChannelSource, numbers: Values) -> Values:
     """Convert the numbers of a channel (not the time) to g, deg/s, deg or degC."""
     if source.unit == COUNTS:
         return (numbers - source.offset) * (1.0 / source.counts_per_unit)
-    return to_house_unit(source.channel, numbers, source.unit)
-
-
-def to_house_unit(channel: str, values: Values, unit: str) -> Values:
-    """Convert values of a channel, not in counts, to its house unit (g, deg/s, deg, degC)."""
-    multiplier, divisor = UNITS[channel][unit]
+    multiplier, divisor = UNITS[source.channel][source.unit]
     if multiplier != 1.0:
-        values = values * multiplier
-    return values / divisor if divisor != 1.0 else values
+        numbers = numbers * multiplier
+    return numbers / divisor if divisor != 1.0 else numbers
 
 
 def joined(tables: Sequence[Log]) -> Log:

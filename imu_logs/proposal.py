@@ -96,8 +96,30 @@ class Proposal:
         return bool(self.sensors()) and not self.unknown()
 
     def text(self, name: str = "my_logger") -> str:
-        """Return the YAML of the profile, with the evidence for each line."""
-        return as_yaml(self, name)
+        """Return the profile as YAML that Hydra reads, with the evidence for each line."""
+        files = ", ".join(Path(f).name for f in self.files)
+        lines = _comment(f"Proposed by python -m pipeline check for {files}. Check each line: no line is certain.")
+        for remark in self.remarks:
+            lines += _comment(f"To decide: {remark}.")
+        topics, shown = self.topic is not None, self.csv
+        if topics:
+            lines += ["defaults:", "  - canonical_csv", "  - _self_", ""]
+            shown = {key: shown[key] for key in ("rate_hz",) if shown[key] is not None}
+        lines += [f"name: {_scalar(name)} # name of the profile, for the report", ""]
+        lines += ["mcap: # logs of messages of every format" if topics else "csv:"]
+        for key, value in shown.items():
+            if key in self.evidence:
+                lines += _comment(self.evidence[key], "  ")
+            lines.append(f"  {key}: {_scalar(value)}")
+        if not self.parts:
+            what = "topics:" if topics else "columns: # channel: the column's name (or index from 0) and its unit"
+            return "\n".join([*lines, f"  {what}", *_entries(self, 0, "    ")]) + "\n"
+        lines += [] if topics else ["  columns: {} # described by part"]
+        lines += ["  parts: # files of one recording, joined on equal time"]
+        for part, file in enumerate(self.parts):
+            lines += [f"    - file: {_scalar(file)}", f"      {'topics' if topics else 'columns'}:"]
+            lines += _entries(self, part, "        ")
+        return "\n".join(lines) + "\n"
 
     def sensors(self) -> set[str]:
         """Return the sensors whose three axes it has."""
@@ -488,33 +510,6 @@ def fields_of(columns: Entries) -> Entries:
         c: {"field": e["column"], **{k: v for k, v in e.items() if k not in ("column", "optional")}}
         for c, e in columns.items()
     }
-
-
-def as_yaml(proposal: Proposal, name: str) -> str:
-    """Return a proposal as the text of a profile that Hydra reads."""
-    files = ", ".join(Path(f).name for f in proposal.files)
-    lines = _comment(f"Proposed by python -m pipeline check for {files}. Check each line: no line is certain.")
-    for remark in proposal.remarks:
-        lines += _comment(f"To decide: {remark}.")
-    topics, shown = proposal.topic is not None, proposal.csv
-    if topics:
-        lines += ["defaults:", "  - canonical_csv", "  - _self_", ""]
-        shown = {key: shown[key] for key in ("rate_hz",) if shown[key] is not None}
-    lines += [f"name: {_scalar(name)} # name of the profile, for the report", ""]
-    lines += ["mcap: # logs of messages of every format" if topics else "csv:"]
-    for key, value in shown.items():
-        if key in proposal.evidence:
-            lines += _comment(proposal.evidence[key], "  ")
-        lines.append(f"  {key}: {_scalar(value)}")
-    if not proposal.parts:
-        what = "topics:" if topics else "columns: # channel: the column's name (or index from 0) and its unit"
-        return "\n".join([*lines, f"  {what}", *_entries(proposal, 0, "    ")]) + "\n"
-    lines += [] if topics else ["  columns: {} # described by part"]
-    lines += ["  parts: # files of one recording, joined on equal time"]
-    for part, file in enumerate(proposal.parts):
-        lines += [f"    - file: {_scalar(file)}", f"      {'topics' if topics else 'columns'}:"]
-        lines += _entries(proposal, part, "        ")
-    return "\n".join(lines) + "\n"
 
 
 def _entries(proposal: Proposal, part: int, indent: str) -> list[str]:

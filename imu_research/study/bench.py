@@ -132,7 +132,7 @@ def _with_noise(
     if noise in OF_WHITE:
         drive = np.sqrt(1.0 - OF_WHITE[noise] ** 2) * rng.standard_normal((count, 3))
         drive[0] = rng.standard_normal(3)
-        added = _white(data_sheet) * scipy.signal.lfilter([1.0], [1.0, -OF_WHITE[noise]], drive, axis=0)
+        added = data_sheet.white(INTERVAL_S) * scipy.signal.lfilter([1.0], [1.0, -OF_WHITE[noise]], drive, axis=0)
     elif noise == "random_walk":
         step = wander * np.sqrt(interval / data_sheet.wander_time_s)
         added = np.cumsum(step * rng.standard_normal((count, 3)), axis=0)
@@ -148,11 +148,6 @@ def _with_noise(
 
 def _interval(case: StudyCase) -> float:
     return INTERVAL_BY_HAND_S if case.by_hand else INTERVAL_S
-
-
-def _white(data_sheet: DataSheet) -> float:
-    """Return the standard deviation of one sample's white noise."""
-    return float(data_sheet.noise_density * np.sqrt(0.5 / INTERVAL_S))
 
 
 def _with_shape(recordings: list[Recording], case: StudyCase) -> list[Recording]:
@@ -205,7 +200,7 @@ def signals_left(case: StudyCase) -> dict[str, float]:
     base = np.concatenate([truth(case.sensor, motion) for motion in motions])
     columns = np.column_stack([np.ones(len(time)), base, *signals])
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    white, n = _white(data_sheet), len(time)
+    white, n = data_sheet.white(INTERVAL_S), len(time)
     each = Blocks(np.arange(n), np.ones(n), time, np.zeros(n), np.zeros(n, np.int64))
     noise = GaussMarkov(each, [Setting(case.wander * data_sheet.bias_wander / white, data_sheet.wander_time_s)])
     products = noise.products(columns / size)[0] * np.outer(size, size) / white**2

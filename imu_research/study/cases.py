@@ -202,7 +202,7 @@ def _names(kind: str, model: str, sensor: str, procedure: str, rng: np.random.Ge
 def _unseen(number: int, seed: int, rng: np.random.Generator) -> StudyCase:
     """Draw an effect that is not observable: in turns in one direction, of the table to a gyroscope, or at rest."""
     cells = [("one_way", "gyroscope", name) for name in sorted(UNSEEN["one_way"]["gyroscope"])]
-    cells += [(way, "gyroscope", name) for way in ("stop_and_go", "one_way") for name in UNSEEN["any"]["gyroscope"][:3]]
+    cells += [(way, "gyroscope", name) for way in ("stop_and_go", "one_way") for name in UNSEEN["any"]["gyroscope"]]
     cells += [("at_rest", "accelerometer", name) for name in UNSEEN["at_rest"]["accelerometer"]]
     procedure, sensor, name = cells[int(rng.integers(len(cells)))]
     hidden = {name: drawn("mpu6050", sensor, name, rng).tolist()}
@@ -214,7 +214,7 @@ def sensor_files(interval_s: float) -> list[str]:
     """Return the shipped sensor files whose rounding to counts is noise: white noise dithers it in both sensors."""
 
     def dithered(data_sheet: DataSheet) -> bool:
-        return bool(data_sheet.noise_density * np.sqrt(0.5 / interval_s) * data_sheet.counts_per_unit >= DITHERED)
+        return data_sheet.white(interval_s) * data_sheet.counts_per_unit >= DITHERED
 
     names = sorted(path.stem for path in (CONFIGS / "sensor").glob("*.yaml"))
     models = {name: shipped_settings(sensor=name).sensor for name in names}
@@ -224,7 +224,8 @@ def sensor_files(interval_s: float) -> list[str]:
 def observable(model: str, sensor: str, procedure: str) -> list[str]:
     """Return the effects that are observable with a procedure at their size."""
     hidden = set(FAINT[model][sensor])
-    hidden.update(UNSEEN["any"].get(sensor, ()), UNSEEN.get(procedure, {}).get(sensor, ()))
+    for kind in ("any", "alike", procedure):
+        hidden.update(UNSEEN.get(kind, {}).get(sensor, ()))
     return [name for name in SIZES[model][sensor] if name not in hidden]
 
 

@@ -109,7 +109,7 @@ class RecordingSet:
         wander = bias_wander([r.time for r in exact], data_sheet.wander_time_s, noise)
         out = []
         for recording, slow in zip(exact, wander, strict=True):
-            white = simulated.white(recording.interval) * noise.standard_normal(slow.shape)
+            white = data_sheet.white(recording.interval) * noise.standard_normal(slow.shape)
             reading = simulated.quantised(
                 np.asarray(recording.reading(self.sensor)) + white + data_sheet.bias_wander * slow
             )

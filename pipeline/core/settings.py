@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from math import sqrt
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -116,6 +117,10 @@ class DataSheet(Section):
         """Return a figure that the sensor's file states; None for a figure of ``generic``."""
         found: float | None = None if name in self.assumed else getattr(self, name)
         return found
+
+    def white(self, interval: float) -> float:
+        """Return the standard deviation of one sample's white noise; ``interval``: between samples, s."""
+        return self.noise_density * sqrt(0.5 / interval)
 
 
 class Sensor(Section, BySensor[DataSheet]):

@@ -56,6 +56,7 @@ from pipeline.core.records import (
 from pipeline.physics import measurement
 from pipeline.physics.effects import effect_of, load_python_effect, register
 from pipeline.physics.effects.base import OF_THE_ROOM
+from pipeline.physics.measurement import Truths
 
 # Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
 # (2 to 32 g), 32 between those of a gyroscope (125 to 4000 deg/s), 57 for rad/s, 1000 for mg and mdps.
@@ -348,7 +349,7 @@ class CompensationStream:
         shaped = {s: value[0] if single else value for s, value in found.items()}
         return Compensated(shaped.get("accelerometer"), shaped.get("gyroscope"))
 
-    def _block(self, arrays: Mapping[str, Values]) -> measurement.Truths:
+    def _block(self, arrays: Mapping[str, Values]) -> Truths:
         """Return the truth of each sensor in a block of samples."""
         readings = {s: arrays[s] for s in SENSORS if s in arrays}
         steps = {s: self.steps[s] for s in readings if s in self.steps}
@@ -362,7 +363,7 @@ class CompensationStream:
             warming = self._slope.apply(clock, warm, slope=True)
         motion_of = partial(measurement.log_motion, clock, temperature=warm, temperature_rate=warming)
 
-        def true_motion(truths: measurement.Truths, number: int) -> Motion:
+        def true_motion(truths: Truths, number: int) -> Motion:
             force, rate = truths.get("accelerometer", zeros), truths.get("gyroscope", zeros)
             end = self._ends[min(number, len(self._ends) - 1)]
             return motion_of(specific_force=force, angular_rate=rate, used=used, end=end)
@@ -373,18 +374,14 @@ class CompensationStream:
         return self._solved(steps, readings, true_motion, used & OF_THE_PAST)
 
     def _solved(
-        self,
-        steps: dict[str, Steps],
-        readings: measurement.Truths,
-        true_motion: Callable[[measurement.Truths, int], Motion],
-        past: set[str],
-    ) -> measurement.Truths:
+        self, steps: dict[str, Steps], readings: Truths, true_motion: Callable[[Truths, int], Motion], past: set[str]
+    ) -> Truths:
         """Subtract the effects that depend on the truth; store the end of the block for each iteration."""
         turns = circular(steps)
         once = {s: self._moving[s] for s, step in steps.items() if step.moving and s not in turns}
         ends: list[measurement.LogEnd] = []
 
-        def motion_of(truths: measurement.Truths, number: int) -> Motion:
+        def motion_of(truths: Truths, number: int) -> Motion:
             motion = true_motion(truths, number)
             if past:
                 ends.append(self._ends[min(number, len(self._ends) - 1)].after(motion, past))

@@ -210,12 +210,9 @@ def implausible(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> 
     entry has ``parameter``, ``value``, ``unit``, ``limit`` of the sensor file, ``ratio`` of the two and
     ``likely_cause``.
     """
-    entries = [
-        _entry(row) | {"likely_cause": row[-1]}
-        for row in _limited(sensor, part, data_sheet)
-        if abs(row[1]) - 2.0 * row[2] > max(MULTIPLE * row[4], row[5])
-    ]
-    return sorted(entries, key=lambda entry: -entry["ratio"])
+    rows = _limited(sensor, part, data_sheet)
+    far = [row for row in rows if abs(row[1]) - 2.0 * row[2] > max(MULTIPLE * row[4], row[5])]
+    return [_entry(row) | {"likely_cause": row[-1]} for row in far]
 
 
 def beyond_limits(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[Entry]:
@@ -223,8 +220,7 @@ def beyond_limits(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -
 
     Parameters as of ``implausible``; an entry has ``parameter``, ``value``, ``unit``, ``limit`` and ``ratio``.
     """
-    entries = [_entry(row) for row in _limited(sensor, part, data_sheet) if abs(row[1]) > row[4]]
-    return sorted(entries, key=lambda entry: -entry["ratio"])
+    return [_entry(row) for row in _limited(sensor, part, data_sheet) if abs(row[1]) > row[4]]
 
 
 def beyond_words(part: Mapping[str, Any] | None) -> str:
@@ -238,10 +234,10 @@ def _entry(row: LimitRow) -> Entry:
     return {"parameter": name, "value": value, "unit": unit, "limit": limit, "ratio": abs(value) / limit}
 
 
-def _limited(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> Iterator[LimitRow]:
-    """Yield the rows of all parameters that the sensor file limits."""
-    yield from _of_bias_and_matrix(sensor, part, data_sheet)
-    yield from limited_effects(sensor, part, data_sheet.effects)
+def _limited(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[LimitRow]:
+    """Return the rows of all parameters that the sensor file limits, the largest ratio first."""
+    rows = [*_of_bias_and_matrix(sensor, part, data_sheet), *limited_effects(sensor, part, data_sheet.effects)]
+    return sorted(rows, key=lambda row: -abs(row[1]) / row[4])
 
 
 def without_rotation(matrix: Values) -> Values:

@@ -183,7 +183,7 @@ def record(
         for s in SENSORS:
             sensor, altered = bench.sensors[s], alter(scene, {name: values for name, (_, values) in effects[s].items()})
             motion = plain if altered is scene else altered.motion(time, temperature)
-            white = sensor.white(unit.interval_s) * rng[s].standard_normal((len(time), 3))
+            white = sensor.data_sheet.white(unit.interval_s) * rng[s].standard_normal((len(time), 3))
             reading = sensor.exact(motion) + white + sensor.data_sheet.bias_wander * wander[s][k]
             readings[s] = np.round(sensor.quantised(reading), decimals_of(sensor.data_sheet))
         whole = Recording(
@@ -540,7 +540,7 @@ def _truth(sensor: SimulatedSensor, effects: Hidden, interval: float) -> dict[st
         },
         **({"definitions": defined} if defined else {}),
         "noise": {
-            "white": sensor.white(interval),
+            "white": sensor.data_sheet.white(interval),
             "wander": sensor.data_sheet.bias_wander,
             "correlation_time": sensor.data_sheet.wander_time_s,
         },

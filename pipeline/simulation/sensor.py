@@ -198,10 +198,6 @@ class SimulatedSensor:
             reading = reading + kind.reading(self.sensor, motion, K, values)
         return reading
 
-    def white(self, interval: float) -> float:
-        """Return the standard deviation of one sample's white noise; interval in s."""
-        return self.data_sheet.noise_density * float(np.sqrt(0.5 / interval))
-
     def quantised(self, reading: Values) -> Values:
         """Round the reading to whole counts and clip it at full scale: (n, 3) array, g or deg/s."""
         counts = np.round(reading * self.data_sheet.counts_per_unit)

@@ -7,7 +7,7 @@ import pytest
 from loggers import GRAVITY
 
 from imu_logs.columns import find_layout
-from imu_logs.proposal import Proposal, as_yaml, not_found
+from imu_logs.proposal import Proposal, not_found
 from pipeline.app.profile_detection.unit_guesses import propose
 
 HZ = 125.0
@@ -90,7 +90,7 @@ def test_an_angle_that_turns_as_gravity_or_the_gyroscope_does_is_proposed_with_i
 
 def test_every_other_column_is_listed_with_what_it_holds() -> None:
     proposal = proposed(turned(8192, "level", header="q1,q2,q3,ticks"))
-    text = as_yaml(proposal, "mine")
+    text = proposal.text("mine")
     assert {w.split()[3] for w in text.splitlines() if "# not used: " in w} == {
         "q1",
         "q2",
@@ -113,8 +113,8 @@ def test_a_rest_shows_no_encoder_and_a_turn_of_the_same_logger_does() -> None:
     rest, turn = turned(8192, "level", still=True), turned(8192, "level")
     alone = proposed(rest)
     assert "table_angle" not in alone.columns[0]
-    assert "# not used: ticks (1000 throughout)" in as_yaml(alone, "mine")
+    assert "# not used: ticks (1000 throughout)" in alone.text("mine")
     both = proposed(rest, turn)
     assert both.columns[0]["table_angle"]["counts_per_unit"] == pytest.approx(8192 / 360)
     assert both.columns[0]["gyro_x"]["unit"] == "rad/s"
-    assert "not used: ticks" not in as_yaml(both, "mine")
+    assert "not used: ticks" not in both.text("mine")

@@ -13,7 +13,7 @@ from unit_settings import ingest_of
 
 from imu_logs.columns import find_layout
 from imu_logs.profile import Checks, csv_formats
-from imu_logs.proposal import Proposal, as_yaml
+from imu_logs.proposal import Proposal
 from imu_logs.text_read import read_csv
 from pipeline.app.config.compose import Composer
 from pipeline.app.profile_detection.unit_guesses import propose
@@ -52,7 +52,7 @@ def test_a_saved_proposal_works_as_a_profile(tmp_path: Path, kind: str) -> None:
     file = written(tmp_path, LOGGERS[kind])
     profile = tmp_path / "configs" / "ingest" / "mine.yaml"
     profile.parent.mkdir(parents=True)
-    profile.write_text(as_yaml(proposed(file), "mine"), encoding="utf-8")
+    profile.write_text(proposed(file).text("mine"), encoding="utf-8")
     config = Composer(tmp_path).unit("U1", ["procedure=multi_position", "ingest=mine"])
     table = read_csv([file], csv_formats(config.ingest), Checks())
     data = motion()
@@ -107,7 +107,7 @@ def test_sessions_one_after_the_other_are_noticed(reference: Path) -> None:
     proposal = proposed(reference / "ferraris_wearable" / "annotated_session.csv")
     assert proposal.columns[0]["accel_x"]["counts_per_unit"] == 2048.0
     assert any("does not increase at 5 rows" in r for r in proposal.remarks)
-    text = as_yaml(proposal, "annotated")
+    text = proposal.text("annotated")
     assert "# not used: part (not all of it is numbers)" in text
     assert "column part labels 9 parts (x_a, x_p, x_rot, y_a ..)" in text
     assert "docs/record.md#parts" in text
@@ -125,7 +125,7 @@ def test_odd_names_of_columns_survive_yaml_and_hydra(tmp_path: Path, cell: str) 
     file.write_text(f"{header}\n{rows}", encoding="utf-8")
     profile = tmp_path / "configs" / "ingest" / "mine.yaml"
     profile.parent.mkdir(parents=True)
-    text = as_yaml(proposed(file), "mine")
+    text = proposed(file).text("mine")
     profile.write_text(text, encoding="utf-8")
     config = Composer(tmp_path).unit("U1", ["procedure=multi_position", "ingest=mine"])
     assert config.ingest.csv["columns"]["time"]["column"] == names["time"]
@@ -140,7 +140,7 @@ def test_text_without_a_table_is_refused_with_its_beginning(tmp_path: Path) -> N
 def test_a_counter_of_samples_is_no_time_until_its_rate_is_stated() -> None:
     text = "n,ax,ay,az\n" + "".join(f"{i},0,0,1.0\n" for i in range(100))
     (proposal,) = propose([find_layout(text.encode(), "log.csv")])
-    entry: dict[str, Any] = yaml.safe_load(as_yaml(proposal, "mine"))["csv"]["columns"]["time"]
+    entry: dict[str, Any] = yaml.safe_load(proposal.text("mine"))["csv"]["columns"]["time"]
     assert entry == {"column": "n", "unit": "counts", "counts_per_unit": "???"}
 
 
@@ -186,7 +186,7 @@ def test_registers_under_names_that_differ_in_one_letter_are_read_as_counts(tmp_
     profile.parent.mkdir(parents=True)
     config = Composer(tmp_path).unit("U1", ["sensor=mpu6050", "sensor.accelerometer.range=4"])
     (proposal,) = propose([layout], config.sensor)
-    profile.write_text(as_yaml(proposal, "mine"), encoding="utf-8")
+    profile.write_text(proposal.text("mine"), encoding="utf-8")
     csv = Composer(tmp_path).unit("U1", ["sensor=mpu6050", "ingest=mine"]).ingest.csv["columns"]
     assert [csv[c]["counts_per_unit"] for c in ("accel_y", "gyro_y", "temperature")] == [8192.0, 65.5, 340.0]
     assert (-1182 - csv["temperature"]["offset"]) / 340.0 == pytest.approx(-1182 / 340 + 36.53)
@@ -199,7 +199,7 @@ def test_counts_that_a_log_at_rest_does_not_tell_are_those_of_the_stated_sensor(
     (proposal,) = propose([layout], Composer(tmp_path).unit("U1", ranges).sensor)
     profile = tmp_path / "configs" / "ingest" / "mine.yaml"
     profile.parent.mkdir(parents=True)
-    profile.write_text(as_yaml(proposal, "mine"), encoding="utf-8")
+    profile.write_text(proposal.text("mine"), encoding="utf-8")
     config = Composer(tmp_path).unit("U1", [*ranges, "ingest=mine"])
     assert config.ingest.csv["columns"]["gyro_z"]["counts_per_unit"] == 65.5
 
@@ -259,7 +259,7 @@ def test_a_log_without_known_names_gives_a_template() -> None:
     text = "t_us,p,q,r,s\n" + "".join(f"{10_000 * i},1,2,{i % 3},4\n" for i in range(100))
     (proposal,) = propose([find_layout(text.encode(), "log.csv")])
     assert proposal.unknown() == [f"{s}_{a}" for s in ("accel", "gyro") for a in "xyz"]
-    written = yaml.safe_load(as_yaml(proposal, "mine"))["csv"]["columns"]
+    written = yaml.safe_load(proposal.text("mine"))["csv"]["columns"]
     assert written["accel_x"] == {"column": "???", "unit": "???"}
 
 

@@ -207,8 +207,8 @@ def test_a_reading_is_bias_plus_the_inverse_matrix_times_the_truth_plus_effects(
 
 def test_white_noise_has_the_density_of_the_data_sheet_up_to_the_nyquist_frequency() -> None:
     sensor = SimulatedSensor("gyroscope", SHEETS.gyroscope, np.zeros(3), np.eye(3))
-    assert sensor.white(0.01) == pytest.approx(0.005 * np.sqrt(50.0))
-    assert sensor.white(0.12) == pytest.approx(0.0102062, abs=1e-7)
+    assert sensor.data_sheet.white(0.01) == pytest.approx(0.005 * np.sqrt(50.0))
+    assert sensor.data_sheet.white(0.12) == pytest.approx(0.0102062, abs=1e-7)
 
 
 def test_readings_are_whole_counts_and_stop_at_full_scale() -> None:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from imu_logs.columns import UnknownLog
 from imu_logs.files import SUFFIXES
 from imu_logs.guesses import TO_DECIDE
-from imu_logs.proposal import Proposal, as_yaml, layouts_of, not_found
+from imu_logs.proposal import Proposal, layouts_of, not_found
 from pipeline.app.commands import parser_of
 from pipeline.app.commands.readings import Reading, campaign_of, config_of_log, recordings_of_files
 from pipeline.app.config.campaign import Campaign, find_campaign, load_campaign
@@ -518,7 +518,7 @@ def _print_proposals(proposals: Sequence[Proposal], sensor_model: Sensor | None,
             if len(groups) > MOST_IN_FULL:
                 print("Every other file is read without a refusal: check it alone for what it holds.\n")
         print(_wrapped(f"PROPOSED PROFILE for {', '.join(proposal.files)}") + "\n")
-        text = as_yaml(proposal, name)
+        text = proposal.text(name)
         print(textwrap.indent(text, "    "))
         if proposal.unknown():
             print(f"Fill in {TO_DECIDE} for {', '.join(proposal.unknown())}.")

@@ -48,7 +48,7 @@ from pipeline.core.records import (
     Values,
 )
 from pipeline.core.settings import Effects, Settings, Table, Uncertainty
-from pipeline.core.verdicts import Verdict, decided_words
+from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
 from pipeline.estimation.design import OTHER_PREFIX
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
@@ -99,7 +99,6 @@ def without_harmful(found: SensorDiagnosis, harmful: Mapping[str, str]) -> Senso
     return replace(
         found,
         verdict=Verdict.UNEXPLAINED if missing else found.verdict,
-        decided_by=decided_words("misfit", found.residual_over_noise) if missing else found.decided_by,
         selected=left,
         candidates={**found.candidates, **harmful},
         reason=f"{found.reason} {told[0].upper()}{told[1:]}.".strip(),
@@ -119,7 +118,6 @@ def without_impossible(found: SensorDiagnosis, case: DiagnosisInput) -> SensorDi
     return replace(
         found,
         verdict=found.verdict if doubted else Verdict.UNEXPLAINED,
-        decided_by=found.decided_by if doubted else decided_words("misfit", found.residual_over_noise),
         selected=(),
         candidates={**found.candidates, **reasons},
         reason=f"{found.reason} {told[0].upper()}{told[1:]}.".strip(),
@@ -144,10 +142,10 @@ def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
         if span < resolution:
             return f"the temperature changes by {span:.2g} degC, less than its resolution of {resolution:.2g} degC"
     used = [r for r in case.recordings if r.reading(case.sensor) is not None]
-    noise, density = case.noise, sheet.stated("noise_density")
-    if density is not None and noise is not None and noise.step is None and used:
+    noise = case.noise
+    if sheet.stated("noise_density") is not None and noise is not None and noise.step is None and used:
         own = noise.source == "static" or (noise.source == "rests" and is_multi_position(case.sensor, case.recordings))
-        excess = float(np.min(noise.white)) / (density * float(np.sqrt(0.5 / used[0].interval))) if own else 0.0
+        excess = float(np.min(noise.white)) / sheet.white(used[0].interval) if own else 0.0
         if excess > TIMES_POSSIBLE:
             return f"the noise is {excess:.2g} times the sensor file's, so that the file is not that of this sensor"
     return ""

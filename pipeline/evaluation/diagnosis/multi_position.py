@@ -49,6 +49,8 @@ from pipeline.evaluation.diagnosis.verdict import verdict_of_selection_by_hand
 from pipeline.evaluation.diagnosis.words import HYSTERESIS, listed, plain
 from pipeline.physics.effects import catalogue, effect_from
 
+Fold = tuple[SelectionByHand, Mask]  # a selection, and the rests that were left out of it
+
 NEEDED_RECORDING = MORE_RESTS
 WITH_FACES = ", in addition to those on the six faces, which determine bias and matrix but no effect"
 LEAST_SPAN = 1.0  # s or degC: of a covariate
@@ -221,7 +223,7 @@ def _over_noise(model: Model, equations: Equations, expected: NoiseHypothesis) -
     return float(np.sqrt(residual @ residual / freedom)) if freedom > 0 else None
 
 
-def _held_out(selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand, Mask]]) -> LeftOut:
+def _held_out(selection: SelectionByHand, folds: Sequence[Fold]) -> LeftOut:
     """Return the errors of each fit of the selection on rests and moves that are left out of it in turn."""
     if not folds:  # a recording for validation, or nothing is selected
         squares = [selection.model.held_out_squares(each.state) for each in selection.fits]
@@ -250,9 +252,7 @@ def _too_few(selection: SelectionByHand, case: DiagnosisInput) -> dict[str, str]
     }
 
 
-def _cross_validation(
-    selection: SelectionByHand, folds: Sequence[tuple[SelectionByHand, Mask]]
-) -> dict[str, Any] | None:
+def _cross_validation(selection: SelectionByHand, folds: Sequence[Fold]) -> dict[str, Any] | None:
     """Return the errors of the whole procedure, selection included, on rests that are left out of it in turn.
 
     ``folds``, ``error_before, error_after`` (rms, g or deg/s), and ``named``: the number of folds that selected each
@@ -266,9 +266,7 @@ def _cross_validation(
     return {"folds": REST_FOLDS, "error_before": before, "error_after": after, "named": dict(named)}
 
 
-def _folds(
-    selection: SelectionByHand, select: Callable[[Model], SelectionByHand]
-) -> list[tuple[SelectionByHand, Mask]]:
+def _folds(selection: SelectionByHand, select: Callable[[Model], SelectionByHand]) -> list[Fold]:
     """Return the selections that leave out every third rest in turn, each with the rests left out.
 
     Empty if nothing was selected, if there is a recording for validation, or with too few rests, as in one soak.

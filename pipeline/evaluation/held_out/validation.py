@@ -69,6 +69,7 @@ from pipeline.estimation.rest_means import count_of_rests
 from pipeline.estimation.stages import StageInput
 from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.evaluation.held_out import error_breakdown as breakdown
+from pipeline.evaluation.held_out.error_breakdown import LinearizedSamples
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, reference_vector, squared_norm_errors
 from pipeline.ingest.quality_flags import STUCK
 from pipeline.physics.effects import bench_priors, effect_of, owner_of
@@ -218,9 +219,7 @@ def residuals_over_temperature(
     return [TemperatureBin(float(w.mean()), float(e.mean()), float(np.sqrt(np.mean(e**2))), len(e)) for w, e in parts]
 
 
-def _expected(
-    case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[breakdown.LinearizedSamples]
-) -> tuple[float, float]:
+def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> tuple[float, float]:
     """Return the interval of the last step's rms error; ``parts``: the samples with their derivatives.
 
     Earth's rotation, where it is left out of a magnitude, changes the rms error by its rate at most.
@@ -258,9 +257,7 @@ def last_error(case: HeldOutCase, samples: Sequence[Samples]) -> HeldOutError | 
     return HeldOutError(float(np.sqrt(np.nanmean(error**2))), *_expected(case, samples, complete))
 
 
-def _agreement(
-    case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[breakdown.LinearizedSamples]
-) -> Agreement | None:
+def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> Agreement | None:
     """Return how the matrix agrees with held-out motion.
 
     None where no held-out motion has a vector reference, the method fixes elements of the matrix, a filter was applied,

@@ -53,6 +53,8 @@ from pipeline.physics.compensation import Compensation, read_calibration, sensor
 from pipeline.physics.effects import effect, effect_of
 from pipeline.physics.measurement import sensor_effects
 
+Counts = Mapping[str, float | None]  # sensor to its counts per g or deg/s, None if not stated
+
 CALIBRATION = "calibration.json"  # name of the format of ``calibrations/<unit>.json``
 # of a file to read; a calibration has some kilobytes, the parameters of a vehicle 100
 MAX_CALIBRATION_BYTES = 50_000_000
@@ -95,9 +97,7 @@ class ImportedCalibration:
         return maps_of_log(log or {})
 
 
-def read_any(
-    file: Path, format_name: str | None = None, counts: Mapping[str, float | None] | None = None
-) -> ImportedCalibration:
+def read_any(file: Path, format_name: str | None = None, counts: Counts | None = None) -> ImportedCalibration:
     """Read a calibration in any format; if the format has a file for each sensor, ``file`` is one of them.
 
     ``format_name``: a name or its beginning (``format_of``), by default found from name and content of the file;
@@ -143,9 +143,7 @@ def _text(file: Path) -> str:
     return read_text(file, MAX_CALIBRATION_BYTES, "a calibration") if file.exists() else read_published(file).decode()
 
 
-def _read_file(
-    file: Path, format_name: str, declared: Format, counts: Mapping[str, float | None]
-) -> ImportedCalibration:
+def _read_file(file: Path, format_name: str, declared: Format, counts: Counts) -> ImportedCalibration:
     text = _text(file)
     try:
         imported = _read(file, format_name, declared, parsed(declared.read_back["kind"], text), counts)
@@ -221,9 +219,7 @@ def _sensors_in(file: Path, declared: Format, content: Node) -> dict[str, dict[s
     }
 
 
-def _read(
-    file: Path, format_name: str, declared: Format, content: Node, counts: Mapping[str, float | None]
-) -> ImportedCalibration:
+def _read(file: Path, format_name: str, declared: Format, content: Node, counts: Counts) -> ImportedCalibration:
     sensors = _sensors_in(file, declared, content)
     if not sensors:
         names = [

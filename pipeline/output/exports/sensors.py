@@ -216,11 +216,6 @@ class ExportedSensor:
         return float(np.sqrt(np.sum(1.0 - np.diag(self.full_K) ** 2 / np.sum(self.full_K**2, axis=1)) / 3.0))
 
     @property
-    def bias_error(self) -> float:
-        """Likewise after a correction by only the bias: ``|1 - K| / sqrt(3)``."""
-        return float(np.linalg.norm(np.eye(3) - self.full_K) / np.sqrt(3.0))
-
-    @property
     def follows_temperature(self) -> bool:
         """Whether the bias depends on the temperature."""
         return bool(set(OF_THE_BIAS) & set(self.effects))
@@ -272,7 +267,8 @@ class ExportedSensor:
         """Return a sentence on the error of a format with only this part of the matrix: full, diagonal or none."""
         if part == "full":
             return []
-        error, what = self.bias_error, f"The matrix of the {self.name} is"
+        # after a correction by only the bias, over all directions of the truth
+        error, what = float(np.linalg.norm(np.eye(3) - self.full_K) / np.sqrt(3.0)), f"The matrix of the {self.name} is"
         if part == "diagonal":
             error, what = self.scale_error, f"Cross-axis terms of the {self.name} are"
         size = f"{error:.2g} g at 1 g" if self.name == "accelerometer" else f"{100 * error:.2g} % of the rate"
