@@ -16,7 +16,7 @@ from unit_settings import settings_of, with_noise
 
 from pipeline.core.records import Recording
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.chip_fit import Chip
+from pipeline.estimation.chips import Chip
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.stages import StageInput, fit_stage
 from pipeline.simulation.description import shipped_settings

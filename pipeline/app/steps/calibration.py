@@ -44,8 +44,7 @@ from pipeline.core.records import (
     coverage_factor,
 )
 from pipeline.estimation.candidates import MOUNTING
-from pipeline.estimation.chip_fit import Chip
-from pipeline.estimation.chips import chip_document
+from pipeline.estimation.chips import Chip, chip_document
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.ingest.axis_maps import axis_maps
 from pipeline.ingest.quality_flags import GAP
