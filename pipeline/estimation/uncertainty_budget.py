@@ -6,7 +6,7 @@ The noise of the readings is of type A, from the residuals (``pipeline.estimatio
 lack of fit. Its parts are stated separately: white noise, the bias instability by the static recording or the sensor
 file, and lack of fit beyond both. All other contributions are of type B, with infinite degrees of freedom:
 
-    limits        : misalignments that rests do not determine (``limit_contribution``)
+    limits        : misalignments that rests do not determine (``multi_position.result.limits_contribution``)
     bench         : the table's stated accuracies (``pipeline.estimation.table_errors``), local gravity
     quantisation  : where white noise does not make the rounding errors of the samples independent
     others        : temperature, repeatability, a time from a count of rows (``pipeline.estimation.stated_lines``)
@@ -188,7 +188,7 @@ def changes_by_hand(
 
     ``gain``: of ``gain_of``.
     """
-    model = copy(_at_mean_temperature(model))
+    model = _at_mean_temperature(model)
     if isinstance(model, AccelerometerModel):
         model.after_moves = True
     warm = bool(np.all(np.isfinite(model.rests.temperature)))
@@ -218,15 +218,14 @@ def gain_of(model: Model, fitted: FitByHand, place: Values) -> Values:
 
 
 def _at_mean_temperature(model: Model) -> Model:
-    """Return the model with the mean temperature of its rests at the one to which effects refer."""
-    mean = np.mean(model.rests.temperature)
+    """Return a copy of the model with the mean temperature of its rests at the one to which effects refer."""
+    out, mean = copy(model), np.mean(model.rests.temperature)
     if not np.isfinite(mean):
-        return model
-    shift, out = REFERENCE_TEMPERATURE - float(mean), copy(model)
+        return out
+    shift = REFERENCE_TEMPERATURE - float(mean)
     out.rests = replace(model.rests, temperature=model.rests.temperature + shift)
     for name in ("moves", "turns", "soaks", "attitudes"):
-        part = getattr(model, name, None)
-        if part is not None:
+        if (part := getattr(model, name, None)) is not None:
             setattr(out, name, replace(part, temperature=part.temperature + shift))
     return out
 
@@ -331,28 +330,6 @@ def clock_line(calibration: SensorCalibration, table: Table) -> tuple[list[Contr
     if ppm is None:
         return [], {TIME_BASE: "table.clock_accuracy_ppm is not stated"}
     return [clock_contribution(calibration, ppm)], {}
-
-
-def limit_contribution(
-    gain: Values, of_limits: Values, curvature: Values, covariance: Values, place: Values
-) -> tuple[Contribution, Values]:
-    """Return the contribution of misalignments by the sensor file's limits, and its first-order covariance.
-
-    A limit is so wide that the square of a misalignment is significant, for example in six positions, where the
-    readings depend on it only to second order. With the curvature H_i of equation i and the covariance C of a fit,
-    ``d^T H_i d / 2`` of a normal error d has the mean ``tr(H_i C) / 2`` and the covariances ``tr(H_i C H_j C) / 2``
-    (JCGM 100, 5.1.2, note).
-
-    ``gain``: (p, n), of the equations over their standard deviations, on the fitted parameters. ``of_limits``: (p, l),
-    change of these by each limit. ``curvature``: (n, p, p), of the equations. ``covariance``: (p, p), C. ``place``:
-    (12, p).
-    """
-    HC = curvature @ covariance
-    mean = 0.5 * np.trace(HC, axis1=1, axis2=2)
-    bent = 0.5 * np.einsum("iab,jba->ij", HC, HC) + np.outer(mean, mean)
-    first = place @ of_limits @ of_limits.T @ place.T
-    total = first + place @ gain @ bent @ gain.T @ place.T
-    return Contribution(LIMIT, "B", NORMAL, total, np.full(len(total), np.inf)), first
 
 
 def combined(

@@ -33,7 +33,8 @@ one attitude a change of the bias along gravity is not distinguished from one of
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 import scipy
@@ -96,49 +97,43 @@ def contrasts(parts: Rests) -> Values:
     return np.asarray(scipy.linalg.block_diag(*blocks))
 
 
+@dataclass(eq=False)
 class AccelerometerModel:
-    """Equations of the accelerometer's rests.
+    """Equations of the accelerometer's rests."""
 
-    ``rests``: rests of the fit. ``directions``: (12, b), change of bias and matrix by each base parameter. ``held``:
-    held-out rests. ``soaks``: parts of soaks. ``faces``: of ``rests``, if they are stated: the full matrix is
-    then free. ``known_by_limit``: parameters with a pseudo-observation, each with its u. ``wander``: whether the
-    equations include the errors by a Gauss-Markov bias.
-    """
+    sensor: ClassVar[str] = "accelerometer"
+    kinds: ClassVar[int] = 1
+    between: ClassVar[float] = 0.0
+    rests: Rests  # of the fit
+    directions: Values  # (12, b), change of bias and matrix by each base parameter
+    gravity: float  # g
+    noise: Noise | None
+    held: Rests | None = None  # held-out rests
+    faces: Faces | None = None  # of ``rests``, if they are stated: the full matrix is then free
+    # parameters with a pseudo-observation, each with its u
+    known_by_limit: Mapping[str, float] = field(default_factory=dict)
+    wander: bool = True  # whether the equations include the errors by a Gauss-Markov bias
+    soaks: Rests | None = None  # parts of soaks
+    after_moves: bool = False  # whether effects see the direction of the last move (``last_moves``)
 
-    sensor = "accelerometer"
-    kinds, between = 1, 0.0
-
-    def __init__(
-        self,
-        rests: Rests,
-        directions: Values,
-        gravity_g: float,
-        noise: Noise | None,
-        *,
-        held: Rests | None = None,
-        faces: Faces | None = None,
-        known_by_limit: Mapping[str, float] | None = None,
-        wander: bool = True,
-        soaks: Rests | None = None,
-    ) -> None:
-        self.rests, self.gravity, self.held, self.faces = rests, gravity_g, held, faces
-        self.soaks = soaks
-        self.noise = noise
-        self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
-        self.directions = directions if faces is None else np.eye(BASE_COUNT)
-        self.known_by_limit = {} if known_by_limit is None or faces is not None else known_by_limit
+    def __post_init__(self) -> None:
+        rests, soaks = self.rests, self.soaks
+        if self.faces is not None:
+            self.directions, self.known_by_limit = np.eye(BASE_COUNT), {}
+        self.white = np.maximum(white_of(rests, self.noise), SMALLEST_NOISE)
         self.rests_equations = len(rests.time)
         shares, stretches = np.eye(len(rests.time)), [rests]
         if soaks is not None:
             self.attitudes, _ = parted(soaks)
-            shares, stretches = self._shares(rests), [rests.select(~rests.soaked), soaks]
-        self.shares = shares[:, : shares.shape[1] if wander else 0]  # (m, t), of each stretch of time in each rest
-        t = self.shares.shape[1]
+            own = rests.recording[:, None] == soaks.recording
+            own = (own & rests.soaked[:, None]) / np.maximum(own.sum(axis=1, keepdims=True), 1)
+            shares, stretches = np.hstack([shares[:, ~rests.soaked], own]), [rests.select(~rests.soaked), soaks]
+        t = shares.shape[1] if self.wander else 0
+        self.shares = shares[:, :t]  # (m, t), of each stretch of time in each rest
         start, length, recording = (
             np.concatenate([getattr(r, n) for r in stretches])[:t] for n in ("start", "length", "recording")
         )
         self.stretches = start, length, recording
-        self.after_moves = False  # whether effects see the direction of the last move (``last_moves``)
 
     def equations(self, state: State, candidates: Sequence[EffectColumns] = ()) -> Equations:
         """Return the linearised equations at given parameters."""
@@ -195,13 +190,6 @@ class AccelerometerModel:
         apart = np.abs(rests.time[:, None] - rests.time) / rests.scatter_time
         same = (rests.recording[:, None] == rests.recording) & ~np.eye(len(size), dtype=bool)
         return np.asarray(np.where(same, np.exp(-apart) * np.outer(size, size), 0.0))
-
-    def _shares(self, rests: Rests) -> Values:
-        """Return the shares of rests that are no soaks, and of the parts of soaks, in each rest: (m, t) array."""
-        assert self.soaks is not None  # noqa: S101
-        own = rests.recording[:, None] == self.soaks.recording
-        own = (own & rests.soaked[:, None]) / np.maximum(own.sum(axis=1, keepdims=True), 1)
-        return np.hstack([np.eye(len(rests.time))[:, ~rests.soaked], own])
 
     def _at_rests(
         self, rests: Rests, force: Values, value: Callable[[Motion], Values], direction: Values | None = None
@@ -274,16 +262,8 @@ class AccelerometerModel:
 
     def without(self, held: Mask) -> AccelerometerModel:
         """Return the model with some of its rests held out."""
-        return AccelerometerModel(
-            self.rests.select(~held),
-            self.directions,
-            self.gravity,
-            self.noise,
-            held=self.rests.select(held),
-            faces=self.faces and self.faces.select(~held),
-            known_by_limit=self.known_by_limit,
-            soaks=self.soaks,
-        )
+        faces = self.faces and self.faces.select(~held)
+        return replace(self, rests=self.rests.select(~held), held=self.rests.select(held), faces=faces)
 
 
 def last_moves(state: State, rests: Rests, up: Values) -> Values:

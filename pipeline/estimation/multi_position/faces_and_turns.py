@@ -71,22 +71,6 @@ def name_of_axis(direction: Values) -> str:
     return f"{'-' if direction[axis] < 0.0 else ''}{AXES[axis]}"
 
 
-def stated_turns(
-    recordings: Sequence[Recording], rests: Rests, procedure: Procedure, role: str = ROLE
-) -> list[StatedTurn]:
-    """Return the turns that the procedure states, or its sheet of recordings; see ``faces_and_turns.turns_of``."""
-    turns = procedure.turns
-    if turns is None:
-        return []
-    bias = np.average(rests.reading, axis=0, weights=rests.count)
-    if procedure.sheet is not None:
-        return _of_sheet(recordings, rests, bias, procedure, role)
-    chosen, moves = _multiples(recordings, rests, bias, turns, role)
-    if role == ROLE:
-        require_turns([(recordings[t.recording].name, name_of_axis(t.direction)) for t in chosen], moves, turns)
-    return chosen
-
-
 def _multiples(
     recordings: Sequence[Recording], rests: Rests, bias: Values, turns: HandTurns, role: str
 ) -> tuple[list[StatedTurn], list[tuple[Recording, float, Values]]]:
@@ -116,15 +100,14 @@ def _multiples(
     return chosen, moves
 
 
-def _of_sheet(
-    recordings: Sequence[Recording], rests: Rests, bias: Values, procedure: Procedure, role: str
+def _of_sheet(  # noqa: PLR0917  (what a sheet states)
+    recordings: Sequence[Recording], rests: Rests, bias: Values, procedure: Procedure, turns: HandTurns, role: str
 ) -> list[StatedTurn]:
     """Return the turns that the sheet states, or a table logged; those without an angle are by whole turns.
 
     Raises ``NotObservableError`` if the gyroscope shows another axis, sense or angle, with those that would agree.
     """
     chosen: list[StatedTurn] = []
-    assert procedure.turns is not None  # noqa: S101
     for index, recording in enumerate(recordings):
         entry = procedure.recordings.get(recording.name)
         if entry is None or entry.direction is None or recording.role != role or recording.gyroscope is None:
@@ -134,7 +117,7 @@ def _of_sheet(
         direction, logged = np.array(entry.direction), recording.source.get(LOGGED_TURNS)
         if logged is None:
             span = _moving(recording, rests.span[own], local)
-            chosen.append(_of_row(recording, index, span, local, entry, procedure.turns))
+            chosen.append(_of_row(recording, index, span, local, entry, turns))
             continue
         for start, stop, stated, error in logged:
             span = slice(int(start), int(stop))
@@ -404,12 +387,21 @@ def turns_of(
     *,
     frame_deg: float = 0.0,
 ) -> TurnsByHand | None:
-    """Return the turns of a stated angle; None if there are none.
+    """Return the turns that the procedure, or its sheet of recordings, states; None if there are none.
 
     ``rests``: all rests of the gyroscope. ``role``: of the recordings that may be one turn; empty for none.
     ``frame_deg``: standard uncertainty of each angle between the frame of the fit and the case, deg.
     """
-    chosen = stated_turns(recordings, rests, procedure, role)
+    turns = procedure.turns
+    if turns is None:
+        return None
+    bias = np.average(rests.reading, axis=0, weights=rests.count)
+    if procedure.sheet is not None:
+        chosen = _of_sheet(recordings, rests, bias, procedure, turns, role)
+    else:
+        chosen, moves = _multiples(recordings, rests, bias, turns, role)
+        if role == ROLE:
+            require_turns([(recordings[t.recording].name, name_of_axis(t.direction)) for t in chosen], moves, turns)
     if not chosen:
         return None
     found = _gathered(recordings, chosen, accelerometer, float(np.radians(frame_deg)))

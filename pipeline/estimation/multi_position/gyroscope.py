@@ -25,8 +25,8 @@ Source: Tedaldi, Pretto & Menegatti, ICRA 2014, eq. 12.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import scipy
@@ -72,37 +72,29 @@ NORMAL_DEGREES_OF_FREEDOM = 1e6  # degrees of freedom beyond which Student's t i
 INTERVAL_DRAWS, INTERVAL_TAIL = 4000, 0.005  # as in the 99 % interval of other held-out errors: 20 draws are beyond it
 
 
+@dataclass(eq=False)
 class GyroscopeModel:
-    """Equations of the gyroscope's rests and moves.
+    """Equations of the gyroscope's rests and moves."""
 
-    ``rests``: all, also held-out ones, at which a move may begin. ``gravity``: at each rest, by the accelerometer.
-    ``fewest``: smallest number of moves that are used. ``turns``: of a stated total angle. ``known_by_limit``: elements
-    of the matrix with a pseudo-observation, each with its u. ``between``: see ``model``. ``frame``: standard
-    uncertainty of each angle between the frame of the fit and the case, rad.
-    """
+    sensor: ClassVar[str] = "gyroscope"
+    every: Rests  # all, also held-out ones, at which a move may begin
+    moves: Moves | None  # None also if they are fewer than ``fewest``
+    at_rests: GravityAtRests  # at each of ``every``, by the accelerometer
+    noise: Noise | None
+    fewest: int = MIN_MOVES  # smallest number of moves that are used
+    turns: TurnsByHand | None = None  # of a stated total angle
+    # elements of the matrix with a pseudo-observation, each with its u
+    known_by_limit: Mapping[str, float] = field(default_factory=dict)
+    between: float = 0.0  # see ``model``
+    frame: float = 0.0  # rad; standard uncertainty of each angle between the frame of the fit and the case
 
-    sensor = "gyroscope"
-
-    def __init__(
-        self,
-        rests: Rests,
-        moves: Moves | None,
-        gravity: GravityAtRests,
-        noise: Noise | None,
-        *,
-        fewest: int = MIN_MOVES,
-        turns: TurnsByHand | None = None,
-        known_by_limit: Mapping[str, float] | None = None,
-        between: float = 0.0,
-        frame: float = 0.0,
-    ) -> None:
-        self.every, self.at_rests, self.noise, self.fewest = rests, gravity, noise, fewest
-        self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
+    def __post_init__(self) -> None:
+        rests, gravity, turns = self.every, self.at_rests, self.turns
+        self.white = np.maximum(white_of(rests, self.noise), SMALLEST_NOISE)
         self.rests, self.force = rests.select(~rests.held_out), gravity.force[~rests.held_out]
-        self.moves, self.turns = moves if moves is not None and moves.count >= fewest else None, turns
-        self.known_by_limit, self.between, self.frame = known_by_limit or {}, between, frame
+        self.moves = self.moves if self.moves is not None and self.moves.count >= self.fewest else None
         self.kinds = 1 if self.moves is None else 2
-        free = self.moves is not None or turns is not None or bool(known_by_limit)
+        free = self.moves is not None or turns is not None or bool(self.known_by_limit)
         self.directions = np.eye(BASE_COUNT)[:, BASE if free else BIAS]
         self.rests_equations = 3 * len(self.rests.time)
         self.of_moves = slice(self.rests_equations, self.rests_equations + (2 * self.moves.count if self.moves else 0))
@@ -164,18 +156,7 @@ class GyroscopeModel:
         out = self.every.held_out.copy()
         out[~self.every.held_out] = held
         moves = None if self.moves is None else self.moves.select(~out[self.moves.after])
-        rests = replace(self.every, held_out=out)
-        part = GyroscopeModel(
-            rests,
-            moves,
-            self.at_rests,
-            self.noise,
-            fewest=self.fewest,
-            turns=self.turns,
-            known_by_limit=self.known_by_limit,
-            between=self.between,
-            frame=self.frame,
-        )
+        part = replace(self, every=replace(self.every, held_out=out), moves=moves)
         part.kinds = self.kinds
         return part
 
@@ -412,17 +393,9 @@ def model_of(
         keys = zip(names, moves.time[:, 0].tolist(), strict=True)
         moves = moves.select(np.array([key not in outlying for key in keys]))
     sheet = procedure.sheet is not None
-    return GyroscopeModel(
-        rests,
-        moves,
-        gravity,
-        noise,
-        fewest=1 if sheet else MIN_MOVES,
-        turns=turns,
-        known_by_limit=known_by_limit,
-        between=between_recordings(rests, turns, noise) if sheet else 0.0,
-        frame=float(np.radians(frame_deg)),
-    )
+    between, frame = between_recordings(rests, turns, noise) if sheet else 0.0, float(np.radians(frame_deg))
+    fewest = 1 if sheet else MIN_MOVES
+    return GyroscopeModel(rests, moves, gravity, noise, fewest, turns, known_by_limit, between, frame)
 
 
 def between_recordings(rests: Rests, turns: TurnsByHand | None, noise: Noise | None) -> float:

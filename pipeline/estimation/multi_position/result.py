@@ -17,6 +17,8 @@ import numpy as np
 import scipy
 
 from pipeline.core.records import (
+    LIMIT,
+    NORMAL,
     Contribution,
     Convergence,
     NoiseParts,
@@ -48,7 +50,6 @@ from pipeline.estimation.uncertainty_budget import (
     effect_parameters,
     gain_of,
     gravity_line,
-    limit_contribution,
     scatter_contribution,
 )
 
@@ -163,7 +164,13 @@ def _places(model: Model, fitted: FitByHand) -> Values:
 
 
 def limits_contribution(model: Model, fitted: FitByHand) -> tuple[list[Contribution], Values]:
-    """Return the line of the misalignments known by the sensor file's limit, if any, and its first-order covariance."""
+    """Return the line of the misalignments known by the sensor file's limit, if any, and its first-order covariance.
+
+    A limit is so wide that the square of a misalignment is significant, for example in six positions, where the
+    readings depend on it only to second order. With the curvature H_i of equation i and the covariance C of a fit,
+    ``d^T H_i d / 2`` of a normal error d has the mean ``tr(H_i C) / 2`` and the covariances ``tr(H_i C H_j C) / 2``
+    (JCGM 100, 5.1.2, note).
+    """
     place = _places(model, fitted)
     if not model.known_by_limit:
         return [], np.zeros((len(place), len(place)))
@@ -175,8 +182,13 @@ def limits_contribution(model: Model, fitted: FitByHand) -> tuple[list[Contribut
     of_limits = gain[:, -len(model.known_by_limit) :]  # their pseudo-observations are the last equations
     if equations.frame is not None:
         of_limits = np.hstack([of_limits, gain @ equations.frame])
-    line, first = limit_contribution(gain, of_limits, curvature(model, fitted), fitted.covariance, place)
-    return [replace(line, remark=", ".join(model.known_by_limit))], first
+    HC = curvature(model, fitted) @ fitted.covariance
+    mean = 0.5 * np.trace(HC, axis1=1, axis2=2)
+    bent = 0.5 * np.einsum("iab,jba->ij", HC, HC) + np.outer(mean, mean)
+    first = place @ of_limits @ of_limits.T @ place.T
+    total = first + place @ gain @ bent @ gain.T @ place.T
+    freedom, remark = np.full(len(total), np.inf), ", ".join(model.known_by_limit)
+    return [Contribution(LIMIT, "B", NORMAL, total, freedom, remark=remark)], first
 
 
 def _with_monte_carlo(
