@@ -24,10 +24,10 @@ import scipy
 
 from pipeline.core.records import Values, coverage_factor
 from pipeline.physics.effects import effect
+from pipeline.physics.effects.base import Effect
 
 if TYPE_CHECKING:
     from pipeline.estimation.ranking import Score
-    from pipeline.physics.effects.base import Effect
 
 MIN_DELTA_BIC = 10.0  # "very strong" evidence (Raftery, Sociological Methodology 25, 1995)
 MIN_DELTA_BIC_OF_SLOW = 22.0  # of a slow effect, see above

@@ -13,27 +13,23 @@ The others stay selected.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
+from pipeline.core.records import Mask, Noise, Values
 from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.estimation.generalized_least_squares import JointFit, fit_terms
 from pipeline.estimation.multi_position.fit import COMPARED_STEP, FitByHand, fit
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
+from pipeline.estimation.multi_position.model import Model
+from pipeline.estimation.multi_position.selection import SelectionByHand
 from pipeline.estimation.observations import without_rows
 from pipeline.estimation.ranking import projection
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
-
-    from pipeline.core.records import Mask, Noise, Values
-    from pipeline.estimation.multi_position.model import Model
-    from pipeline.estimation.multi_position.selection import SelectionByHand
-    from pipeline.estimation.selection import Selection
+from pipeline.estimation.selection import Selection
 
 FEWEST_EXCHANGED = 5  # units of exchange that have a scatter
 MAX_FALSE_HARM, MAX_CORRELATION = 0.05, 0.9  # one-sided; r of successive units, see above

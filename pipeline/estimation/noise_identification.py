@@ -21,12 +21,14 @@ are in doubt if an Allan variance differs from the sum.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import scipy
 
+from pipeline.core.files import JSON
 from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Recording, Values, once_of_log
 from pipeline.estimation.noise_search import (
     ONE_SIDED,
@@ -58,12 +60,6 @@ from pipeline.estimation.noise_terms import (
 )
 from pipeline.physics.signal.filters import temperature_of
 from pipeline.physics.signal.rests import rest_readings, usable
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.files import JSON
-
 
 MIN_SPECTRUM_SAMPLES = 60  # which determine the white noise to a tenth
 SHORTEST_STRETCH = 16  # samples

@@ -35,11 +35,12 @@ Effects of timing move the motion, and are left out: they act where the motion c
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pipeline.core.records import (
     AFTER_BASE,
@@ -67,27 +68,20 @@ from pipeline.core.records import (
     matrix_of,
     standard_uncertainty,
 )
+from pipeline.core.settings import DataSheet, Settings, Table
 from pipeline.estimation.candidates import TILT, limits_of, tilt_like_zeros
 from pipeline.estimation.design import EffectColumns, columns_of_samples, joined_motions
 from pipeline.estimation.engine import LinearMap, ResidualNoise, scaled_inverse
+from pipeline.estimation.gauss_markov import WanderPrior
 from pipeline.estimation.monte_carlo import through, with_trials
 from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
+from pipeline.estimation.multi_position.fit import FitByHand
+from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import Model, motion_at_rests
 from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
 from pipeline.estimation.turns import RowGroups
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Effect, Layout, Owner
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from pipeline.core.settings import DataSheet, Settings, Table
-    from pipeline.estimation.gauss_markov import WanderPrior
-    from pipeline.estimation.multi_position.fit import FitByHand
-    from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
-
 
 OWNERS = (Owner.SENSOR, Owner.RECORDING)  # errors of place, table and timing have lines of their own in the budget
 OF_ACCELEROMETER = "accelerometer."  # before an effect of the accelerometer that changes the gyroscope's parameters

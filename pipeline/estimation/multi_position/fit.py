@@ -37,6 +37,7 @@ proportion to the restricted likelihood with the curves, as the covariance is (`
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
@@ -46,18 +47,14 @@ import numpy as np
 import scipy
 
 from pipeline.core.errors import NotObservableError
+from pipeline.core.records import Values
 from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.design import placed
 from pipeline.estimation.engine import ErrorMixture
 from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, stepped
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.core.records import Values
-
     Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
-
 
 # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 MAX_STEP_HALVINGS = 30  # of a step; a smaller one is rounding

@@ -29,6 +29,7 @@ parameter.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
@@ -39,20 +40,16 @@ import scipy
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.core.records import BIAS, Index, Mask, Motion, Noise, Values, base_values, matrix_of
 from pipeline.estimation import design
+from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.engine import cholesky
 from pipeline.estimation.gauss_markov import NO_INSTABILITY_ODDS, Setting, WanderPrior, block_covariance, selection_grid
+from pipeline.estimation.rest_means import Rests
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from imu_logs.log import Values
-    from pipeline.estimation.design import EffectColumns
     from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
     from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
     from pipeline.estimation.multi_position.moves import Moves
-    from pipeline.estimation.rest_means import Rests
-
 
 Model: TypeAlias = "AccelerometerModel | GyroscopeModel"
 
