@@ -148,13 +148,6 @@ def filtered_alike(part: TurnPart) -> Mask:
     return keep & steady_turns(part, DELAYS_TO_FOLLOW * float(applied["delay_s"]))
 
 
-def noise_of_fit(
-    parts: Sequence[TurnPart], reference: Reference, residuals: Values, design: Values, prior: WanderPrior
-) -> ResidualNoise:
-    """Return the noise of a fit to the stacked samples of parts, from its residuals."""
-    return noise_on_table(reference, residuals, design, blocks_of_samples(parts), prior)
-
-
 def noise_of_turns(
     parts: Sequence[TurnPart], prior: WanderPrior, table: Table, *, two_sided: bool = False
 ) -> ResidualNoise:
@@ -165,7 +158,7 @@ def noise_of_turns(
     X = np.column_stack([np.ones(len(u)), u, np.abs(u)] if two_sided else [np.ones(len(u)), u])
     beta = ScaledColumns.of(X).solve(reading)
     reference = Reference("accelerometer", motions, beta[1:4].T, table)
-    return noise_of_fit(parts, reference, reading - X @ beta, X, prior)
+    return noise_on_table(reference, reading - X @ beta, X, blocks_of_samples(parts), prior)
 
 
 def blocks_of_samples(parts: Sequence[TurnPart]) -> Blocks:

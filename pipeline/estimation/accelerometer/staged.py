@@ -141,16 +141,6 @@ class Extremes:
         """Level reading of each axis, g."""
         return np.asarray(self.level.mean(axis=1))
 
-    @property
-    def excess_high(self) -> Values:
-        """alpha_P, beta_P, gamma_P: angle between the upper extremes of a turn, minus 90 deg."""
-        return wrap(self.angle_high[:, 0] - self.angle_high[:, 1] - 90.0)
-
-    @property
-    def excess_low(self) -> Values:
-        """alpha_N, beta_N, gamma_N: the same of the lower extremes."""
-        return wrap(self.angle_low[:, 0] - self.angle_low[:, 1] - 90.0)
-
     def corrected(self, step: CorrectionStep) -> Self:
         """Return the extremes of readings after a step of a correction."""
 
@@ -327,10 +317,12 @@ def orthogonality(extremes: Extremes) -> EstimatedSteps:
         a, b, c = np.cos(np.radians(excess_deg))
         return np.array([b * c, a * c, a * b] if extremes.as_printed else [1.0, c, a * b])
 
-    positive, negative = factors(extremes.excess_high), factors(extremes.excess_low)
+    angles = {"P": extremes.angle_high, "N": extremes.angle_low}
+    excess = {side: wrap(angle[:, 0] - angle[:, 1] - 90.0) for side, angle in angles.items()}
+    positive, negative = factors(excess["P"]), factors(excess["N"])
     switch_at = np.zeros(3) if extremes.as_printed else extremes.a_zero
     values = _per_axis("O_P", positive, "1") | _per_axis("O_N", negative, "1")
-    values |= _angles({"P": extremes.excess_high, "N": extremes.excess_low})
+    values |= _angles(excess)
     return [TwoSided(positive, negative, switch_at)], values
 
 

@@ -78,8 +78,8 @@ from pipeline.estimation.multi_position.result import NOT_INCLUDED
 from pipeline.estimation.reference_least_squares import of_channels
 from pipeline.estimation.rest_means import Rests, rests_of
 from pipeline.estimation.stages import FitStage, StageInput
-from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, used_motions
+from pipeline.estimation.table_errors import Reference, noise_on_table
+from pipeline.estimation.turns import TurnPart, blocks_of_samples, parts_of, used_motions
 from pipeline.estimation.uncertainty_budget import (
     budgeted,
     clock_line,
@@ -144,7 +144,7 @@ def fit(task: StageInput) -> SensorCalibration:
     design = np.column_stack([np.ones(len(turns.rate)), turns.rate])
     fit, of_bias = _linear_map(turns, A, previous, as_printed=as_printed)
     reference = Reference("gyroscope", used_motions(turns.parts), A, settings.table)
-    noise = noise_of_fit(turns.parts, reference, residuals, design, prior)
+    noise = noise_on_table(reference, residuals, design, blocks_of_samples(turns.parts), prior)
     scatter = noise_contribution(noise, fit, prior)
     matrix = calibration_matrix(A, as_printed=as_printed)
     # The rms error of the integrated angles: rows are turn axes, columns are sensor axes.
@@ -177,19 +177,32 @@ def fit(task: StageInput) -> SensorCalibration:
 
 def _fit_of_sheet(recordings: UnitRecordings, previous: SensorCalibration, settings: Settings) -> SensorCalibration:
     """Fit the matrix to turns by known angles (``known_turns``)."""
-    known = known_turns(recordings, settings)
+    known, as_printed = known_turns(recordings, settings), settings.method.as_printed
     require_turns(known.U)
-    columns, as_printed = ScaledColumns.of(known.U), settings.method.as_printed
-    A = columns.solve(known.Y).T
-    of_noise, of_stated = covariances(known, A, columns)
+    columns, turns, t = ScaledColumns.of(known.U), known.turns, len(known.U)
+    A, W = columns.solve(known.Y).T, columns.weights()
+    of_noise, of_stated = np.zeros((2, BASE_COUNT, BASE_COUNT))  # of bias and A, row by row
+    for c, of_angle in enumerate(known.of_angle):
+        of_noise[4 * c, 4 * c] = known.of_bias[c]
+        of_noise[4 * c + 1 : 4 * c + 4, 4 * c + 1 : 4 * c + 4] = W @ of_angle @ W.T
+    errors: list[Values] = [np.outer(e, d) for e, d in zip(np.diag(turns.error[:t]), turns.direction, strict=True)]
+    for k, first in enumerate(np.unique(turns.group)):
+        signed = np.where(turns.group == first, turns.stated * np.sign(turns.direction @ turns.direction[first]), 0.0)
+        size = np.radians(turns.error[t + 2 * k])
+        errors += [np.outer(signed * size, v) for v in across_axis(turns.direction[first])]
+    for dU in errors:
+        change = np.hstack([np.zeros((3, 1)), A @ dU.T @ W.T]).ravel()
+        of_stated += np.outer(change, change)
     theta = np.column_stack([previous.bias, A]).ravel()
-    results = partial(_results, as_printed=as_printed)
-    J = derivative(results, theta, np.full(theta.size, DIFFERENCE_STEP))
+    J = derivative(partial(_results, as_printed=as_printed), theta, np.full(theta.size, DIFFERENCE_STEP))
     matrix, left = calibration_matrix(A, as_printed=as_printed), known.Y - known.U @ A.T
     rms, details = float(np.sqrt(np.mean(np.sum(left**2, axis=1)))), StageDetails(rests=len(known.rests.time))
     found = _calibration(previous, known.Y, known.U, A, matrix, J @ (of_noise + of_stated) @ J.T, rms, details)
-    base = J[BASE]
-    return with_budget(found, base @ of_noise @ base.T, base @ of_stated @ base.T, settings)
+    of_noise, of_stated = (J[BASE] @ each @ J[BASE].T for each in (of_noise, of_stated))
+    noise = scatter_contribution(of_noise, np.inf, remark="white noise, bias wander, and the bias of each recording")
+    angles = Contribution(ANGLES, "B", NORMAL, of_stated, np.full(BASE_COUNT, np.inf))
+    clock, missing = clock_line(found, settings.table)
+    return combined(found, [noise, angles, *clock], NOT_INCLUDED | missing)
 
 
 def _calibration(  # noqa: PLR0917  (of one stage)
@@ -402,30 +415,3 @@ def fit_bias(recordings: UnitRecordings, settings: Settings) -> SensorCalibratio
     stage = StageResult("bias", parameters, correction=(Subtract(known.bias),), details=details)
     found = SensorCalibration("gyroscope", bias=known.bias, stages=(stage,))
     return combined(found, [scatter_contribution(covariance, np.inf)], dict(NOT_INCLUDED))
-
-
-def covariances(known: KnownTurns, A: Values, columns: ScaledColumns) -> tuple[Values, Values]:
-    """Return the covariance of bias and A, row by row, by noise and by angles and axes: (12, 12) arrays."""
-    W, turns = columns.weights(), known.turns
-    of_noise, of_stated = np.zeros((BASE_COUNT, BASE_COUNT)), np.zeros((BASE_COUNT, BASE_COUNT))
-    for c, of_angle in enumerate(known.of_angle):
-        of_noise[4 * c, 4 * c] = known.of_bias[c]
-        of_noise[4 * c + 1 : 4 * c + 4, 4 * c + 1 : 4 * c + 4] = W @ of_angle @ W.T
-    t = len(turns.stated)
-    errors: list[Values] = [np.outer(e, d) for e, d in zip(np.diag(turns.error[:t]), turns.direction, strict=True)]
-    for k, first in enumerate(np.unique(turns.group)):
-        signed = np.where(turns.group == first, turns.stated * np.sign(turns.direction @ turns.direction[first]), 0.0)
-        size = np.radians(turns.error[t + 2 * k])
-        errors += [np.outer(signed * size, v) for v in across_axis(turns.direction[first])]
-    for dU in errors:
-        change = np.hstack([np.zeros((3, 1)), A @ dU.T @ W.T]).ravel()
-        of_stated += np.outer(change, change)
-    return of_noise, of_stated
-
-
-def with_budget(found: SensorCalibration, of_noise: Values, of_stated: Values, settings: Settings) -> SensorCalibration:
-    """Return a calibration with its budget; both covariances are of bias and matrix, (12, 12)."""
-    noise = scatter_contribution(of_noise, np.inf, remark="white noise, bias wander, and the bias of each recording")
-    angles = Contribution(ANGLES, "B", NORMAL, of_stated, np.full(BASE_COUNT, np.inf))
-    clock, missing = clock_line(found, settings.table)
-    return combined(found, [noise, angles, *clock], NOT_INCLUDED | missing)

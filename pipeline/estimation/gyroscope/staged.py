@@ -47,8 +47,8 @@ from pipeline.core.records import (
 from pipeline.core.settings import Settings
 from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative
 from pipeline.estimation.stages import FitStage, StageInput, details_on_table
-from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.turns import TurnPart, noise_of_fit, parts_of, steady_turns, used_motions
+from pipeline.estimation.table_errors import Reference, noise_on_table
+from pipeline.estimation.turns import TurnPart, blocks_of_samples, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
 from pipeline.physics.signal.rests import runs
 
@@ -193,7 +193,7 @@ def fit(task: StageInput) -> SensorCalibration:
     x, y, z = np.split(derivative(chain, here, np.full(here.size, DIFFERENCE_STEP_DPS)), 3, axis=1)
     map_ = LinearMap((weights, weights, weights), (x, y, z))
     reference = Reference("gyroscope", used_motions(samples.parts), theta[1:].T, settings.table)
-    noise = noise_of_fit(samples.parts, reference, residuals, design, prior)
+    noise = noise_on_table(reference, residuals, design, blocks_of_samples(samples.parts), prior)
     scatter = noise_contribution(noise, map_, prior)
     after = corrected(found.steps, samples.reading)
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(samples.rate, axis=1)
