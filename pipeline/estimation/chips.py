@@ -266,8 +266,8 @@ def fit_chips(reference: Chip, other: Chip, sensors: Sequence[str]) -> RotationF
                 f"the chips have {common:.0f} s in common; expected recordings of the same names and times with the "
                 f"same sensors, {LEAST_S:g} s or more without gaps"
             )
-        rows = _joined(used)
-        R, clear, fits = _fitted(sensors, rows)
+        both = _joined(used)
+        R, clear, fits = _fitted(sensors, both)
         steps = {fit.sensor: fit.step[fit.names.index("time_offset")] for fit in fits}
         total = {s: offset[s] + float(step) for s, step in steps.items()}
         if max(map(abs, steps.values())) < SMALL_SHIFT_S:
@@ -279,7 +279,7 @@ def fit_chips(reference: Chip, other: Chip, sensors: Sequence[str]) -> RotationF
     span = sum(float(np.ptp(t)) for t in times)
     length = max(min(SHORTEST_BLOCK_S, span / 12.0), span / BIAS_BLOCKS)
     blocks = Blocks.of_rows([(t, np.ones(len(t))) for t in times], range(len(times)), length)
-    return RotationFits(R, fits, rows, clear, blocks, _joined(held_out) if held_out else None)
+    return RotationFits(R, fits, both, clear, blocks, _joined(held_out) if held_out else None)
 
 
 def _joined(pairs: Sequence[BothChips]) -> BothChips:

@@ -433,15 +433,13 @@ class FreeCurve(Effect):
         self.contains = (self.name + BEND,)
         self.middle, self.half = 0.5 * (low + high), 0.5 * (high - low)
         self.layout = Layout.PER_AXIS if covariate == "input" else Layout.EVERY_AXIS
-        self.count = {"input": CURVE_DEGREE - 1, "angle": 2 * MAX_CURVE_CYCLES, "rate": CURVE_DEGREE + 2}.get(
-            covariate, CURVE_DEGREE
-        )
+        counts = {"input": CURVE_DEGREE - 1, "angle": 2 * MAX_CURVE_CYCLES, "rate": CURVE_DEGREE + 2}
+        self.count = counts.get(covariate, CURVE_DEGREE)
 
     def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return a coefficient for each curve and axis."""
-        return tuple(
-            EffectParameter(f"c{k}_{axis}", unit_of(sensor), "coefficient") for axis in "xyz" for k in range(self.count)
-        )
+        names = [f"c{k}_{axis}" for axis in "xyz" for k in range(self.count)]
+        return tuple(EffectParameter(name, unit_of(sensor), "coefficient") for name in names)
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the curves; zeros for a recording without the covariate."""
@@ -464,12 +462,8 @@ class FreeCurve(Effect):
 class Bend(Effect):
     """A bend in the dependence on temperature, from one end of the span, with a coefficient for each axis."""
 
-    name, owner, layout, needs = (
-        f"{OTHER_PREFIX}temperature{BEND}",
-        Owner.RECORDING,
-        Layout.EVERY_AXIS,
-        ("temperature",),
-    )
+    name, needs = f"{OTHER_PREFIX}temperature{BEND}", ("temperature",)
+    owner, layout = Owner.RECORDING, Layout.EVERY_AXIS
     meaning, excitation, experiment, source = "Physics outside the catalogue.", "", "", ""
 
     def __init__(self, forms: Sequence[tuple[float, float, bool]], form: int = 0) -> None:

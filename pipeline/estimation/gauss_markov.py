@@ -44,9 +44,7 @@ MAX_PRIOR_WIDTHS = 3.0  # widths of the prior beyond which the residuals alone d
 NO_INSTABILITY_ODDS = 9.0  # odds of no bias instability at all if none is stated
 TIME_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation times of the grid, over that of the prior
 TIME_PRIOR = (0.1, 0.2, 0.4, 0.2, 0.1)
-BIAS_RATIO_GRID = np.append(
-    0.0, 10.0 ** np.arange(-2.4, 0.85, 0.1)
-)  # ratios of the grid: bias to white noise of a sample
+BIAS_RATIO_GRID = np.append(0.0, 10.0 ** np.arange(-2.4, 0.85, 0.1))  # of bias to white noise of a sample
 OVERLAP_S = 1e-6  # blocks that follow each other overlap by less, from rounding
 RANDOM_WALK = 8.0  # correlation time over the measured one, with the same variance of short differences
 # A random walk of the bias: factors on ratio and time of a setting, and its share of that setting's prior. Of 80

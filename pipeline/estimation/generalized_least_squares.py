@@ -388,10 +388,8 @@ def calibration_of(
         rows = BASE_COUNT + np.flatnonzero(is_fixed_at_zero)
         change[rows] = covariance[rows] = covariance[:, rows] = 0.0
         of_terms = np.split(is_fixed_at_zero, np.cumsum([len(term.values) for term in fit.terms])[:-1])
-        terms = [
-            replace(t, values=np.where(fixed, 0.0, t.values)) for t, fixed in zip(fit.terms, of_terms, strict=True)
-        ]
-        fit = replace(fit, terms=tuple(terms))
+        pairs = zip(fit.terms, of_terms, strict=True)
+        fit = replace(fit, terms=tuple(replace(t, values=np.where(fixed, 0.0, t.values)) for t, fixed in pairs))
         effects, parameters = effect_parameters(sensor, fit.terms, covariance)
     details = StageDetails(
         samples=round(observations.samples),

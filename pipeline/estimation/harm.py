@@ -185,9 +185,7 @@ def left_out(
             known(k, count) or fit(part, each.state, selection.hypotheses, selection.bounds, small=COMPARED_STEP)
             for k, part in enumerate(models)
         ]
-        rests.append(
-            np.concatenate([_at_rests(model, part, fitted) for part, fitted in zip(models, fits, strict=True)])
-        )
+        rests.append(np.concatenate([_at_rests(model, part, f) for part, f in zip(models, fits, strict=True)]))
         if moving:
             errors = [part.direction_errors(f.state)[0] for part, f in zip(others, fits, strict=True)]
             moves.append(np.concatenate(errors) ** 2)

@@ -168,10 +168,8 @@ def _faint(this: Effect, selection: Selection) -> str:
 
 def not_observable_by_hand(selection: by_hand.SelectionByHand, configured: Sequence[str]) -> dict[str, str]:
     """Return the reason for each effect that rests and moves cannot show, without those in the model."""
-    modelled = [*configured, *selection.names]
-    return _hidden(
-        selection.model.sensor, modelled, lambda this: _reason_by_hand(this, selection), selection.model.rests.kinds
-    )
+    model, modelled = selection.model, [*configured, *selection.names]
+    return _hidden(model.sensor, modelled, lambda this: _reason_by_hand(this, selection), model.rests.kinds)
 
 
 def slow_by_hand(selection: by_hand.SelectionByHand, hidden: Collection[str]) -> dict[str, str]:

@@ -71,9 +71,8 @@ class Ranking:
             if name in fitted or term.effect.moves:
                 self.candidates.append(fitted.get(name, term))
             else:
-                self.candidates += [
-                    EffectColumns(term.effect, values) for values in term.effect.starts(observations.sensor)
-                ]
+                starts = term.effect.starts(observations.sensor)
+                self.candidates += [EffectColumns(term.effect, values) for values in starts]
         configured = [replace(fitted[term.effect.name], full=True) for term in base.terms]
         design = Design(observations, [*configured, *self.candidates], fit.K, fit.scale, project=True)
         walks = [] if fit.terms else random_walks(settings).values()  # for the posterior at the same fit
@@ -165,9 +164,8 @@ class Ranking:
         inner = np.stack([products[:, at, at] for at in places])
         cross = np.stack([products[:, at, -1] for at in places])
         squares = np.einsum("tii->ti", self.products)
-        definite = inner + UNIT_COLUMN_RIDGE * np.stack([squares[:, at] for at in places])[..., None] * np.eye(
-            inner.shape[-1]
-        )
+        ridge = UNIT_COLUMN_RIDGE * np.stack([squares[:, at] for at in places])
+        definite = inner + ridge[..., None] * np.eye(inner.shape[-1])
         solved = np.linalg.solve(definite, cross[..., None])[..., 0]
         rss = products[:, -1, -1] - np.sum(cross * solved, axis=2)
         likelihood = self.log_likelihood(rss)

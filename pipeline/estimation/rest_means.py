@@ -436,9 +436,8 @@ def _of_recording(recording: Recording, sensor: str, rests: tuple[Rest, ...]) ->
     scatter = [np.sum((reading[s][good[s]] - mean) ** 2, axis=0) for s, mean in zip(inside, means, strict=True)]
     by_hand = recording.accelerometer is not None and recording.table_angle is None and recording.kind != SOAK
     creeps = [creep_of_rest(recording, a, b) for a, b in span.tolist()] if by_hand else []
-    rate, error, about = (
-        posterior_creep_rates(creeps) if creeps else (np.zeros((len(span), 3)), np.zeros(len(span)), 0.0)
-    )
+    none = np.zeros((len(span), 3)), np.zeros(len(span)), 0.0
+    rate, error, about = posterior_creep_rates(creeps) if creeps else none
     if sensor == "accelerometer" and by_hand:  # without the tilt of a unit that creeps
         scatter = [c.squares * max(n - 1, 1) / max(c.freedom, 1) for c, n in zip(creeps, counts, strict=True)]
     start = time[span[:, 0]]

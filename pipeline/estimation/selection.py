@@ -69,10 +69,9 @@ def select(
         """Select effects by all rows of the observations; ``near``: fits to most of them, from which fits start."""
         starts, candidates = starts_of(configured, observations, known, accelerometer), {}
         for this in candidates_for(observations, configured):
+            zeros = np.zeros(len(this.parameters(observations.sensor)))
             prior = prior_of(this, observations, accelerometer, configured)
-            candidates[this.name] = EffectColumns(
-                this, np.zeros(len(this.parameters(observations.sensor))), prior=prior
-            )
+            candidates[this.name] = EffectColumns(this, zeros, prior=prior)
         models = [[*candidates.values()], *starts]
         key = select, tuple(tuple(term.key for term in terms) for terms in models), data_sheet.model_dump_json(), search
         return observations.once(key, lambda: selected(observations, starts, candidates, near))

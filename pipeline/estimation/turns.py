@@ -40,9 +40,8 @@ ROW_RATE_SHARE = 1.0 / 30.0  # of the fastest rate: the ramps alone tell a nonli
 FINEST_STEP_S = 2.1e-3
 ALL_SAMPLES = 3  # of a row, at which a shifted motion is computed: longer rows need three points each
 PIECED, PIECES = 64, (1 / 32, 1 / 8, 7 / 8, 31 / 32)  # samples of a row that is divided, at these shares of it
-MOVED_FIELDS = (  # of a turn that is shifted in time
-    *("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate", "level", "angle", "rate"),
-)
+# fields of the motion in a turn that is shifted in time
+MOVED_FIELDS = "specific_force", "angular_rate", "angular_acceleration", "specific_force_rate", "level", "angle", "rate"
 MEDIAN_OF_DIFFERENCES = 0.9099  # median of (w[n+1] - w[n])^2 of white noise of variance 1: 2 times that of chi-square
 SCATTERED = 6.0  # standard deviations of a chi-square above its mean, and half its square for the tail of few samples
 MAX_BEND_DPS, MAX_BEND_SHARE = 0.05, 1e-3  # see ``reference_valid``

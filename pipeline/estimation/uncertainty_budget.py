@@ -278,13 +278,13 @@ def scatter_contribution(
     covariance: Values, degrees_of_freedom: float, parts: NoiseParts | None = None, remark: str = ""
 ) -> Contribution:
     """Return the contribution of the readings' scatter for a fit that computes its covariance directly."""
-    freedom = np.full(len(covariance), float(degrees_of_freedom))
-    return Contribution(
-        NOISE_SOURCE, "A", "Student's t", covariance, freedom, parts=parts or NoiseParts(), remark=remark
-    )
+    freedom, parts = np.full(len(covariance), float(degrees_of_freedom)), parts or NoiseParts()
+    return Contribution(NOISE_SOURCE, "A", "Student's t", covariance, freedom, parts=parts, remark=remark)
 
 
-def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float, unit: str) -> Contribution | str:
+def _quantisation(
+    noise: ResidualNoise, fit: LinearMap, counts_per_unit: float, unit: str
+) -> tuple[list[Contribution], dict[str, str]]:
     """Return the contribution of rounding to whole counts, or why it has no separate line.
 
     With white noise of half a count or more, the rounding errors of the samples are independent, of variance 1/12
@@ -292,11 +292,13 @@ def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float, 
     """
     step = 1.0 / counts_per_unit
     if np.all(noise.white >= DITHERED * step):
-        return f"contained in the {NOISE_SOURCE}, which reach {float(noise.white.min()) / step:.1f} counts or more"
+        size = float(noise.white.min()) / step
+        return [], {QUANTISATION_SOURCE: f"contained in the {NOISE_SOURCE}, which reach {size:.1f} counts or more"}
     label = noise.blocks.label(fit.weights[0].shape[1])
     rough = np.where(noise.white < DITHERED * step, 1.0, 0.0) * np.ones((len(label), 3))
     effects = [fit.of_groups(rough * axis, label, len(noise.blocks.weight)) for axis in np.eye(3)]
-    return type_b(QUANTISATION_SOURCE, RECTANGULAR, step / np.sqrt(12.0), unit, np.concatenate(effects, axis=1))
+    u, effect = step / np.sqrt(12.0), np.concatenate(effects, axis=1)
+    return [type_b(QUANTISATION_SOURCE, RECTANGULAR, u, unit, effect)], {}
 
 
 def gravity_line(calibration: SensorCalibration, table: Table) -> tuple[list[Contribution], dict[str, str]]:
@@ -369,25 +371,22 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     if TILT in estimated and tilt_like_zeros(reference.motions, estimated) is not None:
         absent["levelling"] = ACROSS
 
-    def rounding(fit: LinearMap) -> Contribution | str:
+    def rounding(fit: LinearMap) -> tuple[list[Contribution], dict[str, str]]:
         if joint:
-            return f"contained in the {NOISE_SOURCE}"
+            return [], {QUANTISATION_SOURCE: f"contained in the {NOISE_SOURCE}"}
         return _quantisation(noise, fit, counts, SENSOR_UNITS[sensor])
 
-    lines, missing, rounded = list(contributions), {"temperature": TEMPERATURE}, rounding(fit)
-    if isinstance(rounded, str):
-        missing[QUANTISATION_SOURCE] = rounded
-    else:
-        lines.append(rounded)
+    rounded, contained = rounding(fit)
     modelled = [*estimated, *(e.name for e in calibration.effects)]
     at_limits = changes_on_table(reference, fit, modelled, settings.sensor.of(sensor))
-    complete = combined(replace(calibration, at_limits=at_limits), [*lines, *found], {**absent, **missing})
+    missing = {**absent, "temperature": TEMPERATURE, **contained}
+    complete = combined(replace(calibration, at_limits=at_limits), [*contributions, *rounded, *found], missing)
     trials = settings.uncertainty.monte_carlo
     if not trials:
         return complete
     first = fit.first()
     stated, _ = table_errors(reference, first, estimated)
-    covariances = [c.covariance for c in (*stated, rounding(first)) if isinstance(c, Contribution)]
+    covariances = [c.covariance for c in (*stated, *rounding(first)[0])]
     draw = through(noise.posterior(first), covariances, results)
     return with_trials(complete, draw, trials, contributions[1:])
 

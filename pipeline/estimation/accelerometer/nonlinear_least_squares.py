@@ -83,9 +83,7 @@ NAME = "nonlinear_least_squares"
 FIT_STAGES = {NAME: FitStage(sensors=("accelerometer",), accepts=("readings",), changes=("bias", "matrix"), free=True)}
 LOWER_ROWS, LOWER_COLUMNS = np.tril_indices(3)
 TRIANGLE = slice(BIAS.stop, None)  # of the nine values: the elements of L; the bias comes first
-PLACE = np.arange(BASE_COUNT)[
-    [*range(BIAS.stop), *(MATRIX.start + np.ravel_multi_index((LOWER_ROWS, LOWER_COLUMNS), (3, 3)))]
-]
+PLACE = np.append(np.arange(BIAS.stop), MATRIX.start + np.ravel_multi_index((LOWER_ROWS, LOWER_COLUMNS), (3, 3)))
 PLACED = np.eye(BASE_COUNT)[:, PLACE]
 ELEMENTS = [(AXES[i], AXES[j]) for i, j in zip(LOWER_ROWS, LOWER_COLUMNS, strict=True)]
 PARAMETER_NAMES = np.array(PARAMETERS)
@@ -322,9 +320,7 @@ def _fitted(
     noises = prior_hypotheses(known, float(np.mean(model.white)), model.kinds)
     if known.wander == 0.0:  # on a table the wander follows from all readings
         noises = [noise for noise in noises if noise.bias.ratio == 0.0]
-    if (
-        len(equations.residual) - len(PARAMETER_NAMES) <= 1
-    ):  # too few rows to show a scatter: the prior of the wander replaces it
+    if len(equations.residual) - len(PARAMETER_NAMES) <= 1:  # too few rows to show a scatter: the prior replaces it
         wander = Setting(prior.wander / float(np.mean(model.white)), prior.time)  # which rests of one file share
         scatter = prior.wander / float(np.median(equations.error[: model.rests_equations]))
         noises = [NoiseHypothesis(wander, (0.0,)) if rows.by_hand else NoiseHypothesis(WHITE_SETTING, (scatter,))]

@@ -540,9 +540,8 @@ def fit(task: StageInput) -> SensorCalibration:
 def _linear_map(sinusoids: Sequence[Sequence[Sinusoid]], theta: Values, chain: Callable[[Values], Values]) -> LinearMap:
     """Return the map from readings to ``CorrectedForces.vector``, by the derivative of all stages so far."""
     here = chain(theta)
-    columns = np.stack(
-        [(chain(theta + DIFFERENCE_STEP_G * e) - here) / DIFFERENCE_STEP_G for e in np.eye(len(theta))], axis=1
-    )
+    steps = DIFFERENCE_STEP_G * np.eye(len(theta))
+    columns = np.stack([(chain(theta + step) - here) / DIFFERENCE_STEP_G for step in steps], axis=1)
     x, y, z = (np.asarray(scipy.linalg.block_diag(*(turn[c].weights for turn in sinusoids))) for c in range(3))
     J_x, J_y, J_z = np.split(columns, np.cumsum([len(x), len(y)]), axis=1)
     return LinearMap((x, y, z), (J_x, J_y, J_z))

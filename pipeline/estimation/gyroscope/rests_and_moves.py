@@ -84,7 +84,8 @@ def fit_robustly(model: GyroscopeModel, fit_model: Callable[..., FitByHand], rec
         if np.abs(weight - before).max() < SETTLED_WEIGHT_CHANGE:
             break
         variance = np.where(t > 0.0, (error / np.maximum(t, 1e-12)) ** 2, 0.0)
-        model = model.with_excess(variance * (1.0 / weight - 1.0))
+        model = copy(model)
+        model.excess = variance * (1.0 / weight - 1.0)
         fitted = fit_model(model, start=fitted.state, known=(model.equations(fitted.state), fitted.scores))
         t, error = _over_noise(model, fitted)
     outlying = [
@@ -185,9 +186,8 @@ def fit(task: StageInput) -> SensorCalibration:
         angles = model.turns.described(fitted.state)
         details = replace(details, turns=angles, turn_axes=axes, departures=departures)
     stage = StageResult(NAME, correction=(Subtract(fitted.state.bias), Multiply(fitted.state.matrix)), details=details)
-    return after_stage(
-        SensorCalibration("gyroscope", stages=task.stages), stage, model, fitted, settings, other=accelerometer
-    )
+    before = SensorCalibration("gyroscope", stages=task.stages)
+    return after_stage(before, stage, model, fitted, settings, other=accelerometer)
 
 
 def _require_recordings(recordings: Sequence[Recording], procedure: Procedure) -> None:

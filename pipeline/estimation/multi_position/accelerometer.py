@@ -324,12 +324,10 @@ def model_of(
     used, soaks = parted(rests.select(~rests.held_out))
     faces = faces_of(used, (used.reading - calibration.bias) @ calibration.matrix.T, settings.procedure.faces)
     details = [stage.details for stage in calibration.stages]
-    by_limit = {name: u for detail in details for name, u in (detail.known_by_limit or {}).items()}
+    known = {name: u for detail in details for name, u in (detail.known_by_limit or {}).items()}
     for noise_of_means in (detail.noise_of_means for detail in details if detail.noise_of_means is not None):
         used = replace(used, own=np.full(len(used.time), noise_of_means**2))
     for detail in details:
         used = replace(used, scatter_time=detail.scatter_time_s or used.scatter_time)
     directions = _directions(calibration)
-    return AccelerometerModel(
-        used, directions, gravity, noise, held=held, faces=faces, known_by_limit=by_limit, soaks=soaks
-    )
+    return AccelerometerModel(used, directions, gravity, noise, held, faces, known, soaks=soaks)

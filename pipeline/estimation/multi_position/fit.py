@@ -202,9 +202,8 @@ def project_out(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -> 
     rest = white - basis @ (basis.transpose(0, 2, 1) @ white)
     blocks = [slice(start, stop) for start, stop in pairwise(edges.tolist())]
     raw = [rest[:, :, block] for block in blocks]
-    factors = [
-        _orthonormalizers(Z.transpose(0, 2, 1) @ Z, sizes[:, block]) for Z, block in zip(raw, blocks, strict=True)
-    ]
+    pairs = zip(raw, blocks, strict=True)
+    factors = [_orthonormalizers(Z.transpose(0, 2, 1) @ Z, sizes[:, block]) for Z, block in pairs]
     log_determinant = np.array([log - 2.0 * h.prior for (_, log), h in zip(whitened, hypotheses, strict=True)])
     return ProjectedCandidates(raw, factors, rest[:, :, -1], basis, log_determinant)
 

@@ -24,7 +24,6 @@ Source: Tedaldi, Pretto & Menegatti, ICRA 2014, eq. 12.
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -103,7 +102,7 @@ class GyroscopeModel:
         self.gravity = float(np.median(np.linalg.norm(gravity.force, axis=1)))
         if self.moves is not None:
             self.before, self.after = gravity.at_end[self.moves.before], gravity.at_start[self.moves.after]
-            self.excess = np.zeros(self.moves.count)
+            self.excess = np.zeros(self.moves.count)  # deg^2, variance of a further independent error of each move
 
     def equations(self, state: State, candidates: Sequence[EffectColumns] = ()) -> Equations:
         """Return the linearised equations at given parameters."""
@@ -141,12 +140,6 @@ class GyroscopeModel:
             return np.zeros(0)
         error, _ = self._rate_at_rest(self.every.select(held), self.at_rests.force[held], state)
         return np.asarray(np.sum((error @ state.matrix.T) ** 2, axis=1))
-
-    def with_excess(self, variance: Values) -> GyroscopeModel:
-        """Return the model with an additional independent error of each move; ``variance``: (k,), deg^2."""
-        out = copy(self)
-        out.excess = variance
-        return out
 
     def without(self, held: Mask) -> GyroscopeModel:
         """Return the model with the rests ``held``, and the moves that end at them, held out.

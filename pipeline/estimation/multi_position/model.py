@@ -344,13 +344,11 @@ def prior_hypotheses(prior: WanderPrior, white: float, kinds: int) -> list[Noise
     ``prior``: of the bias instability. ``white``: white noise of a sample, unit of the sensor. ``kinds``: number of
     kinds of scatter.
     """
-    bias = np.append(
-        0.0, prior.wander * INSTABILITY_FACTORS if prior.wander > 0.0 else white * np.array(INSTABILITY_RATIOS)
-    )
+    steps = prior.wander * INSTABILITY_FACTORS if prior.wander > 0.0 else white * np.array(INSTABILITY_RATIOS)
+    bias = np.append(0.0, steps)
     pairs = zip((bias / white).tolist(), prior.log_belief(bias).tolist(), strict=True)
-    none = float(
-        np.log(NO_INSTABILITY_ODDS * (len(START_SCATTERS) - 1))
-    )  # no scatter is stated, so that none at all is the likeliest
+    # no scatter is stated, so that none at all is the likeliest
+    none = float(np.log(NO_INSTABILITY_ODDS * (len(START_SCATTERS) - 1)))
     hypotheses = [
         NoiseHypothesis(Setting(ratio, prior.time, belief), level, none=none)
         for ratio, belief in pairs

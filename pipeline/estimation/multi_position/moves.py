@@ -227,9 +227,8 @@ def clocks_of(time: Values, rate: Values, moves: Sequence[slice], white: Values)
     if whole is not None:
         rounded = np.abs(time - whole).max() <= ROUNDED_STAMP_INTERVALS * (whole[1] - whole[0])
         gain = _roughness(time, rate, white) - _roughness(whole, rate, white)
-        return [
-            (whole if gain > (-CLEAR_CLOCK_GAIN if rounded else CLEAR_CLOCK_GAIN) else time)[span] for span in moves
-        ]
+        regular = gain > (-CLEAR_CLOCK_GAIN if rounded else CLEAR_CLOCK_GAIN)
+        return [(whole if regular else time)[span] for span in moves]
     pairs = [(span, _regular_stamps(time[span])) for span in moves]
     gain = sum(
         _roughness(time[span], rate[span], white) - _roughness(line, rate[span], white)
@@ -314,11 +313,10 @@ def observed_rests(
         return None if of_rate is None else (of_rate, _no_gravity(len(of_rate.time)))
     if of_force is None or of_rate is None:
         return None
-    keys = [list(zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)) for r in (of_force, of_rate)]
+    pair = of_force, of_rate
+    keys = [list(zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)) for r in pair]
     both = set(keys[0]) & set(keys[1])
-    of_force, of_rate = (
-        r.select(np.array([key in both for key in k])) for r, k in zip((of_force, of_rate), keys, strict=True)
-    )
+    of_force, of_rate = (r.select(np.array([k in both for k in of])) for r, of in zip(pair, keys, strict=True))
     if len(of_rate.time) == 0:
         return None
     return of_rate, gravity_of(recordings, of_force, accelerometer, moved)

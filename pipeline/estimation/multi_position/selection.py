@@ -67,9 +67,7 @@ class CandidateScores:
     scores: dict[str, Score] = field(default_factory=dict)  # of those that the equations show
     # mean gain with its parameters at their limits; infinite without limits
     visible: dict[str, float] = field(default_factory=dict)
-    slowest: dict[str, float] = field(
-        default_factory=dict
-    )  # the smallest of all starts, of effects with time constants
+    slowest: dict[str, float] = field(default_factory=dict)  # the smallest of all starts, where they are several
     shown: dict[str, Values] = field(default_factory=dict)  # orthonormal directions under the model's best hypothesis
     spare: dict[str, float] = field(default_factory=dict)  # factor on its gain; 0 with too few equations to judge it
     signal: dict[str, Values] = field(default_factory=dict)  # its fitted, whitened signal there
@@ -96,9 +94,8 @@ def fit_configured(  # noqa: PLR0917  (what a fit starts from)
     """Fit base and configured effects, from the best of their starts; ``small``: see ``fit``."""
     fits = []
     for terms in starts_of(configured, model.sensor, start):
-        state = State(
-            start.bias, start.matrix, tuple(EffectColumns(t.effect, np.array(t.values, float)) for t in terms)
-        )
+        own = tuple(EffectColumns(t.effect, np.array(t.values, float)) for t in terms)
+        state = State(start.bias, start.matrix, own)
         fits.append(fit(model, state, hypotheses, limits or {}, small=small))
     return max(fits, key=lambda fitted: fitted.log_likelihood)
 
@@ -187,10 +184,8 @@ class SelectionByHand:
         out = CandidateScores()
         for j, term in enumerate(terms):
             name, count = term.effect.name, projected.count(j, at)
-            added, shows = (
-                count + len(term.effect.nonlinear),
-                count > 0 and not adds_nothing(Q, equations.candidates[j]),
-            )
+            added = count + len(term.effect.nonlinear)
+            shows = count > 0 and not adds_nothing(Q, equations.candidates[j])
             factor = projected.correction(j, at, added, equations.scatter) if shows else 0.0
             seen = factor * _gain_at(self.limits[name], projected.raw[j][at]) if factor > 0.0 else 0.0
             if term.effect.nonlinear:
@@ -259,10 +254,9 @@ class SelectionByHand:
         """Fit a candidate together with some of the selected effects; ``scored``: the scores given these."""
         if score.name not in scored.fits:
             start, (term, known) = self._state(names), scored.start[score.name]
-            state = replace(start, terms=(*start.terms, term))
-            scored.fits[score.name] = fit(
-                self.model, state, self.hypotheses, self.bounds, known=known, small=COMPARED_STEP
-            )
+            start = replace(start, terms=(*start.terms, term))
+            near = fit(self.model, start, self.hypotheses, self.bounds, known=known, small=COMPARED_STEP)
+            scored.fits[score.name] = near
         return scored.fits[score.name]
 
     def _fitted(self, names: Sequence[str]) -> FitByHand:
