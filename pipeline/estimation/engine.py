@@ -20,20 +20,10 @@ weight: a hypothesis with a large instability and little weight then determines 
 Stated accuracies of the bench (type B) are propagated by the same map. They are nuisance parameters with a normal prior
 that the estimator does not fit (consider parameters; Schmidt 1966), and add ``J A Z diag(u^2) Z^T A^T J^T``.
 
-Solve linear and nonlinear least squares, with a certificate of the minimum.
-
-    x = argmin |r(x)|^2,    covariance = sigma^2 (J^T J)^-1
-
-where
-
-    r     : (n,) residuals; for the linear problem r = y - A x
-    J     : (n, p) derivative of r with respect to x
-    sigma : standard deviation of one residual: given, or sqrt(|r|^2 / (n - p))
-
-Columns are scaled to unit norm d, so that units do not matter, and factorised as ``A = Q U diag(s) V^T diag(d)``; the
-singular values s show which combinations the data determine. The certificate of a minimum is the largest cosine between
-the residual and a column of the Jacobian, which is zero at a minimum (Bates & Watts, Nonlinear Regression Analysis,
-1988, section 2.2.3).
+Linear least squares ``x = argmin |y - A x|^2``: columns are scaled to unit norm d, so that units do not matter, and
+factorised as ``A = Q U diag(s) V^T diag(d)``; the singular values s show which combinations the data determine. The
+certificate of a minimum is the largest cosine between the residual and a column of the Jacobian, which is zero at a
+minimum (Bates & Watts, Nonlinear Regression Analysis, 1988, section 2.2.3).
 """
 
 from __future__ import annotations

@@ -285,29 +285,24 @@ def fit_best(
     Effects of timing are first fitted with the base alone: far from their values a linear step is inaccurate, and other
     effects would absorb their signal.
     """
+
+    def best() -> JointFit:
+        begin, choices = start, combinations
+        timing = [term for term in choices[0] if term.effect.moves and not np.any(term.values)]
+        if timing and len(timing) < len(choices[0]):  # they move the rows, and so change the likelihood of the starts
+            begin = fit_terms(observations, timing, start, settings)
+            fitted = {term.effect.name: term.values for term in begin.terms}
+            choices = [[replace(t, values=fitted.get(t.effect.name, t.values)) for t in each] for each in choices]
+
+        def likelihood(terms: Sequence[EffectColumns]) -> float:
+            design = design_at(observations, _with_all_columns(begin, terms))
+            return _solve(design, observations, settings).log_likelihood
+
+        chosen = choices[0] if len(choices) == 1 else max(choices, key=likelihood)
+        return fit_terms(observations, chosen, begin, settings)
+
     key = fit_best, start.key, tuple(tuple(term.key for term in terms) for terms in combinations), tuple(settings)
-    return observations.once(key, lambda: _fit_best(observations, combinations, start, settings))
-
-
-def _fit_best(
-    observations: Observations,
-    combinations: Sequence[Sequence[EffectColumns]],
-    start: Start,
-    settings: Sequence[Setting],
-) -> JointFit:
-    def likelihood(terms: Sequence[EffectColumns]) -> float:
-        design = design_at(observations, _with_all_columns(start, terms))
-        return _solve(design, observations, settings).log_likelihood
-
-    timing = [term for term in combinations[0] if term.effect.moves and not np.any(term.values)]
-    if timing and len(timing) < len(combinations[0]):  # they move the rows, and so change the likelihood of the starts
-        start = fit_terms(observations, timing, start, settings)
-        fitted = {term.effect.name: term.values for term in start.terms}
-        combinations = [
-            [replace(term, values=fitted.get(term.effect.name, term.values)) for term in each] for each in combinations
-        ]
-    chosen = combinations[0] if len(combinations) == 1 else max(combinations, key=likelihood)
-    return fit_terms(observations, chosen, start, settings)
+    return observations.once(key, best)
 
 
 def require_observable(observations: Observations, fit: JointFit) -> None:

@@ -19,56 +19,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.core.records import AFTER_BASE, BIAS, MATRIX, Contribution, Mask, MonteCarlo, SensorCalibration, Values
+from pipeline.core.records import AFTER_BASE, BIAS, MATRIX, Contribution, MonteCarlo, SensorCalibration, Values
 from pipeline.estimation.engine import ErrorMixture, draw_normal
 
 Draw = Callable[[np.random.Generator, int], Values]
 
 SEED = 101  # any number
+COVERAGE = 0.95  # probability of an interval
 BATCH = 500  # trials drawn at a time, which bounds the memory
 TWO_DIGITS = 1_000_000  # trials
 NEWTONS = 6  # each squares the relative error of a step; one by a wide prior starts at some 0.5
 # of the largest singular value of unit columns, the root of 1e-13: the rounding of their products
 MIN_SINGULAR_VALUE_SHARE = 3e-7
-
-
-class Distribution(NamedTuple):
-    """The results of a Monte Carlo run: estimate and standard uncertainty, (n,), and coverage intervals, (n, 2).
-
-    The intervals have as much probability below as above (7.7).
-    """
-
-    estimate: Values
-    standard_uncertainty: Values
-    symmetric: Values
-
-
-class IntervalComparison(NamedTuple):
-    """The interval by the law of propagation against the one by Monte Carlo: (n,) arrays.
-
-    ``low``, ``high``: difference of the lower and of the upper ends. ``borne_out``: whether both are within delta, the
-    ``tolerance``.
-    """
-
-    tolerance: Values
-    low: Values
-    high: Values
-    borne_out: Mask
-
-
-def distribution_of(results: ArrayLike, probability: float = 0.95) -> Distribution:
-    """Return estimate, standard uncertainty and coverage interval of (M, n) drawn results."""
-    values = np.sort(np.asarray(results, float), axis=0)
-    M = len(values)
-    inside = round(probability * M)
-    low = (M - inside) // 2
-    symmetric = np.stack([values[low], values[min(low + inside, M - 1)]], axis=1)
-    return Distribution(values.mean(axis=0), values.std(axis=0, ddof=1), symmetric)
 
 
 def numerical_tolerance(standard_uncertainty: ArrayLike, digits: int = 2) -> Values:
@@ -79,14 +45,36 @@ def numerical_tolerance(standard_uncertainty: ArrayLike, digits: int = 2) -> Val
     return np.asarray(0.5 * 10.0**exponent)
 
 
-def compare(
-    estimate: ArrayLike, expanded_uncertainty: ArrayLike, found: Distribution, *, digits: int = 2
-) -> IntervalComparison:
-    """Compare ``y +- U`` by the law of propagation with the interval of a Monte Carlo run of the same probability."""
-    y, U = np.atleast_1d(np.asarray(estimate, float)), np.atleast_1d(np.asarray(expanded_uncertainty, float))
-    tolerance = numerical_tolerance(np.minimum(found.standard_uncertainty, U), digits)
-    low, high = np.abs(y - U - found.symmetric[:, 0]), np.abs(y + U - found.symmetric[:, 1])
-    return IntervalComparison(tolerance, low, high, (low <= tolerance) & (high <= tolerance))
+def compared(
+    results: ArrayLike, estimate: ArrayLike, expanded_uncertainty: ArrayLike, *, digits: int = 2
+) -> MonteCarlo:
+    """Compare ``y +- U`` of n parameters by the law of propagation with the 95 % interval of (M, n) drawn results.
+
+    The interval has as much probability below as above (7.7). A parameter without an uncertainty is confirmed.
+    """
+    values, y = np.sort(np.asarray(results, float), axis=0), np.atleast_1d(np.asarray(estimate, float))
+    U, u = np.atleast_1d(np.asarray(expanded_uncertainty, float)), values.std(axis=0, ddof=1)
+    M, known = len(values), U > 0.0
+    inside = round(COVERAGE * M)
+    first = (M - inside) // 2
+    low, high = values[first], values[min(first + inside, M - 1)]
+    tolerance = numerical_tolerance(np.minimum(u, U), digits)
+    d_low, d_high = np.abs(y - U - low), np.abs(y + U - high)
+    return MonteCarlo(
+        trials=M,
+        seed=SEED,
+        digits=digits,
+        estimate=y,
+        expanded_uncertainty=U,
+        mean=values.mean(axis=0),
+        standard_uncertainty=u,
+        low=low,
+        high=high,
+        tolerance=np.where(known, tolerance, 0.0),
+        d_low=d_low,
+        d_high=d_high,
+        validated=((d_low <= tolerance) & (d_high <= tolerance)) | ~known,
+    )
 
 
 def through(posterior: ErrorMixture, stated: Sequence[Values], results: Callable[[Values], Values]) -> Draw:
@@ -119,27 +107,9 @@ def with_trials(
         for source in direct:
             values = values + draw_normal(rng, source.covariance, len(values))
         drawn.append(values)
-    estimate = calibration.parameters.values
     assert calibration.budget is not None  # noqa: S101  (see above)
-    expanded, digits = calibration.parameters.expanded_uncertainty, 2 if trials >= TWO_DIGITS else 1
-    found = distribution_of(np.concatenate(drawn))
-    against = compare(estimate, expanded, found, digits=digits)
-    known = expanded > 0.0
-    run = MonteCarlo(
-        trials=trials,
-        seed=SEED,
-        digits=digits,
-        estimate=estimate,
-        expanded_uncertainty=expanded,
-        mean=found.estimate,
-        standard_uncertainty=found.standard_uncertainty,
-        low=found.symmetric[:, 0],
-        high=found.symmetric[:, 1],
-        tolerance=np.where(known, against.tolerance, 0.0),
-        d_low=against.low,
-        d_high=against.high,
-        validated=against.borne_out | ~known,
-    )
+    parameters, digits = calibration.parameters, 2 if trials >= TWO_DIGITS else 1
+    run = compared(np.concatenate(drawn), parameters.values, parameters.expanded_uncertainty, digits=digits)
     return replace(calibration, budget=replace(calibration.budget, monte_carlo=run))
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.core.records import coverage_factor
 from pipeline.estimation.engine import derivative
-from pipeline.estimation.monte_carlo import compare, distribution_of, numerical_tolerance
+from pipeline.estimation.monte_carlo import compared, numerical_tolerance
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from tests.estimation.complex_step import solve_linear
 
@@ -92,19 +92,20 @@ def four_rectangular(generator: np.random.Generator, trials: int) -> np.ndarray:
 
 
 def test_jcgm_101_9_2_3_sum_of_four_rectangular_quantities() -> None:
-    found = distribution_of(four_rectangular(np.random.default_rng(101), 4_000_000).sum(axis=1, keepdims=True))
-    assert round(float(found.standard_uncertainty[0]), 2) == 2.00
-    assert np.round(found.symmetric[0], 2).tolist() == [-3.88, 3.88]
-    exact = 2.0 * np.sqrt(3.0) * (2.0 - 0.6**0.25)
-    assert np.abs(found.symmetric[0]) == pytest.approx([exact, exact], abs=0.01)
+    drawn = four_rectangular(np.random.default_rng(101), 4_000_000).sum(axis=1, keepdims=True)
     U = coverage_factor(np.inf) * 2.0
     assert round(U, 2) == 3.92
-    beside = compare([0.0], [U], found)  # two digits: 2.0 = 20 x 10^-1, delta = 0.05
-    assert beside.tolerance.tolist() == [0.05]
-    assert beside.borne_out.tolist() == [True]
-    three = compare([0.0], [U], found, digits=3)
+    found = compared(drawn, [0.0], [U])  # two digits: 2.0 = 20 x 10^-1, delta = 0.05
+    assert round(float(found.standard_uncertainty[0]), 2) == 2.00
+    interval = np.concatenate([found.low, found.high])
+    assert np.round(interval, 2).tolist() == [-3.88, 3.88]
+    exact = 2.0 * np.sqrt(3.0) * (2.0 - 0.6**0.25)
+    assert np.abs(interval) == pytest.approx([exact, exact], abs=0.01)
+    assert found.tolerance.tolist() == [0.05]
+    assert found.validated.tolist() == [True]
+    three = compared(drawn, [0.0], [U], digits=3)
     assert three.tolerance.tolist() == pytest.approx([0.005])
-    assert three.borne_out.tolist() == [False]
+    assert three.validated.tolist() == [False]
 
 
 def test_jcgm_101_7_9_2_numerical_tolerance() -> None:
@@ -113,5 +114,5 @@ def test_jcgm_101_7_9_2_numerical_tolerance() -> None:
 
 
 def test_the_interval_of_a_skew_distribution_has_as_much_outside_on_either_side() -> None:
-    found = distribution_of(np.random.default_rng(1).standard_normal((200_000, 1)) ** 2)
-    assert found.symmetric[0] == pytest.approx([0.00098, 5.02], abs=0.06)
+    found = compared(np.random.default_rng(1).standard_normal((200_000, 1)) ** 2, [1.0], [1.0])
+    assert np.concatenate([found.low, found.high]) == pytest.approx([0.00098, 5.02], abs=0.06)
