@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.core.records import Motion, Recording, SensorCalibration, Values
 from pipeline.core.settings import DataSheet, Settings, Table
-from pipeline.estimation.design import MAX_BEND_SHARE_OF_ROOM, Bend, EffectColumns, NormalPrior, placed
+from pipeline.estimation.design import MAX_BEND_SHARE_OF_ROOM, Bend, EffectColumns, NormalPrior, Terms, placed
 from pipeline.estimation.gates import possible
 from pipeline.estimation.observations import Observations
 from pipeline.physics.effects import catalogue, effect, stated_priors
@@ -165,9 +165,7 @@ def limits_of(sensor: str, data_sheet: DataSheet) -> dict[str, Values]:
     return {name: values for name, values in limits.items() if len(values)}
 
 
-def offered(
-    names: Sequence[str], terms: Sequence[EffectColumns], covariance: Values, data_sheet: DataSheet, sensor: str
-) -> list[str]:
+def offered(names: Sequence[str], terms: Terms, covariance: Values, data_sheet: DataSheet, sensor: str) -> list[str]:
     """Return the selected effects for ``auto``: none if one of them is not possible (``gates.possible``).
 
     ``terms``: of the fit, the last parameters of its ``covariance``.

@@ -37,7 +37,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import groupby, pairwise, product
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
@@ -68,6 +68,7 @@ MOTION_FIELDS = (  # fields of ``Motion`` on which formulas depend
     "direction", "temperature_rate",
 )  # fmt: skip
 Result = TypeVar("Result")
+JoinedMotions: TypeAlias = "list[tuple[Motion, list[Motion]]]"  # one for several recordings, and those that it joins
 OTHER_PREFIX = "other_"  # prefix of the names of free curves
 BEND = ":bend"  # suffix of the name of the second form; answers state it under the name of the first
 BEND_WIDTHS = np.geomspace(0.1, 0.5, 12)  # of a bend, shares of the span: sharper ones are steps, wider ones parabolas
@@ -117,20 +118,23 @@ class EffectColumns:
         return of(sensor, motion, K, self.values)
 
 
-def placed(terms: Sequence[EffectColumns], base: int = BASE_COUNT) -> dict[str, tuple[EffectColumns, slice]]:
+Terms: TypeAlias = Sequence[EffectColumns]
+
+
+def placed(terms: Terms, base: int = BASE_COUNT) -> dict[str, tuple[EffectColumns, slice]]:
     """Return each term and the slice of its parameters, which follow ``base`` parameters, by the effect's name."""
     edges = np.cumsum([base, *(len(term.values) for term in terms)]).tolist()
     return {t.effect.name: (t, slice(*edge)) for t, edge in zip(terms, pairwise(edges), strict=True)}
 
 
-def stepped(terms: Sequence[EffectColumns], step: Values) -> tuple[list[EffectColumns], Values]:
+def stepped(terms: Terms, step: Values) -> tuple[list[EffectColumns], Values]:
     """Return terms after a step of their parameters, and the step taken, which effects may limit."""
     moved = [replace(t, values=t.effect.stepped(t.values, step[at])) for t, at in placed(terms, 0).values()]
     taken = [new.values - old.values for new, old in zip(moved, terms, strict=True)]
     return moved, np.concatenate([np.zeros(0), *taken])
 
 
-def true_motion(part: RecordingRows, terms: Sequence[EffectColumns], but: Effect | None = None) -> Motion:
+def true_motion(part: RecordingRows, terms: Terms, but: Effect | None = None) -> Motion:
     """Return the true motion of the sensor at the timestamps, with all effects of timing except ``but``."""
     movers = [term for term in terms if term.effect.moves and term.effect is not but and np.any(term.values)]
     if not movers:
@@ -143,7 +147,7 @@ def true_motion(part: RecordingRows, terms: Sequence[EffectColumns], but: Effect
     return part.moved[key]
 
 
-def without_unknown_motion(observations: Observations, terms: Sequence[EffectColumns]) -> Observations:
+def without_unknown_motion(observations: Observations, terms: Terms) -> Observations:
     """Remove the rows that effects of timing shift to times of unknown motion; without any, return the same object."""
     known = [true_motion(part, terms).reference_valid for part in observations.parts]
     if all(mask is None or mask.all() for mask in known):
@@ -152,7 +156,7 @@ def without_unknown_motion(observations: Observations, terms: Sequence[EffectCol
     return without_rows(observations, lost)
 
 
-def motions_of(part: RecordingRows, terms: Sequence[EffectColumns]) -> list[Motion]:
+def motions_of(part: RecordingRows, terms: Terms) -> list[Motion]:
     """Return the motion on which each term acts, and last the motion of the base.
 
     A term with a slope by the motion of the base gets that.
@@ -162,7 +166,7 @@ def motions_of(part: RecordingRows, terms: Sequence[EffectColumns]) -> list[Moti
     return [*(everything if own is None else true_motion(part, terms, own) for own in acting), everything]
 
 
-def joined_motions(motions: Sequence[Motion]) -> list[tuple[Motion, list[Motion]]]:
+def joined_motions(motions: Sequence[Motion]) -> JoinedMotions:
     """Return the motions of successive recordings that hold the same signals as one, each with those that it joins."""
     joined = []
     for held, group in groupby(motions, lambda motion: [name for name in MOTION_FIELDS if motion.has(name)]):
@@ -180,9 +184,7 @@ def _joined(motions: Sequence[Motion], name: str) -> Values:
     return np.concatenate([getattr(motion, name) for motion in motions])
 
 
-def columns_of_samples(
-    term: EffectColumns, sensor: str, joined: Sequence[tuple[Motion, list[Motion]]], K: Values
-) -> Values:
+def columns_of_samples(term: EffectColumns, sensor: str, joined: JoinedMotions, K: Values) -> Values:
     """Return the columns of a term whose regressors at a sample depend on the motion there alone."""
     columns = []
     for motion, members in joined:
@@ -249,7 +251,7 @@ class Design:
     def __init__(
         self,
         observations: Observations,
-        terms: Sequence[EffectColumns],
+        terms: Terms,
         K: Values,
         scale: Values,
         *,
@@ -289,7 +291,7 @@ class Design:
             found._own = [Products(blocks, weight, own.columns) for own in self._own]  # noqa: SLF001
         return found
 
-    def _add_stops(self, observations: Observations, terms: Sequence[EffectColumns], K: Values) -> None:
+    def _add_stops(self, observations: Observations, terms: Terms, K: Values) -> None:
         """Add the errors of the angle, as parameters after the readings, with separate columns for each axis."""
         motions = [true_motion(part, terms) for part in observations.parts]
         before, after, stop, last = errors_of_stops(observations.sensor, motions, K)
@@ -303,7 +305,7 @@ class Design:
             self._total[c] = np.append(self._total[c], self.count + 1 + np.arange(self.stops))
             self._at[c] = np.arange(len(self._total[c]))
 
-    def _place(self, sensor: str, terms: Sequence[EffectColumns]) -> None:
+    def _place(self, sensor: str, terms: Terms) -> None:
         """Assign to each axis its columns of A, and the parameter of each column."""
         local: list[list[int]] = [[0, 1, 2, 3] for _ in range(3)]
         total: list[list[int]] = [[c, *range(row.start, row.stop)] for c, row in enumerate(MATRIX_ROWS)]
@@ -331,10 +333,10 @@ class Design:
         self._total = [np.array([*index, parameters]) for index in total]
         self.count, self._width = parameters, width + 3
 
-    def _fill(self, A: Values, observations: Observations, terms: Sequence[EffectColumns], K: Values) -> None:
+    def _fill(self, A: Values, observations: Observations, terms: Terms, K: Values) -> None:
         """Write the columns of base and terms; the first column is 1 already."""
         sensor = observations.sensor
-        known: dict[tuple[int, ...], list[tuple[Motion, list[Motion]]]] = {}
+        known: dict[tuple[int, ...], JoinedMotions] = {}
         *of_terms, everything = zip(*(motions_of(part, terms) for part in observations.parts), strict=True)
         A[:, 1:4] = np.concatenate([truth(sensor, motion) for motion in everything])
         for term, motions, places in zip(terms, of_terms, self._columns, strict=True):

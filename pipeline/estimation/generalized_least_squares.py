@@ -46,8 +46,8 @@ from pipeline.core.settings import Settings
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed, parameter_names, require_available, starts_of
 from pipeline.estimation.design import (
     Design,
-    EffectColumns,
     Start,
+    Terms,
     motions_of,
     ordinary_base,
     placed,
@@ -117,9 +117,7 @@ class JointFit(Start):
         return self._designs[observations]
 
 
-def fit_terms(
-    observations: Observations, terms: Sequence[EffectColumns], start: Start, settings: Sequence[Setting]
-) -> JointFit:
+def fit_terms(observations: Observations, terms: Terms, start: Start, settings: Sequence[Setting]) -> JointFit:
     """Fit base and effects from a start.
 
     ``terms``: effects, at the start of their nonlinear parameters. ``settings``: noise settings over which the
@@ -166,13 +164,13 @@ def fit_terms(
     return found
 
 
-def _with_all_columns(start: Start, terms: Sequence[EffectColumns]) -> Start:
+def _with_all_columns(start: Start, terms: Terms) -> Start:
     """Return a base with terms whose parameters all have a column."""
     full = (replace(term, values=np.array(term.values, float), full=True) for term in terms)
     return Start(start.bias, start.K, start.scale, tuple(full))
 
 
-def design_at(observations: Observations, at: Start, candidates: Sequence[EffectColumns] | None = None) -> Design:
+def design_at(observations: Observations, at: Start, candidates: Terms | None = None) -> Design:
     """Return the design of a model at given parameters with its residual, or that of the terms ``candidates``."""
     residual, base = _residual(observations, at)
     terms, project = (at.terms, False) if candidates is None else (candidates, True)
@@ -275,33 +273,30 @@ def _residual_noise(
 
 
 def fit_best(
-    observations: Observations,
-    combinations: Sequence[Sequence[EffectColumns]],
-    start: Start,
-    settings: Sequence[Setting],
+    observations: Observations, choices: Sequence[Terms], start: Start, settings: Sequence[Setting]
 ) -> JointFit:
-    """Fit from the combination of starts with the largest likelihood after one linear step.
+    """Fit from the combination of starts among ``choices`` with the largest likelihood after one linear step.
 
     Effects of timing are first fitted with the base alone: far from their values a linear step is inaccurate, and other
     effects would absorb their signal.
     """
 
     def best() -> JointFit:
-        begin, choices = start, combinations
+        begin, possible = start, choices
         timing = [term for term in choices[0] if term.effect.moves and not np.any(term.values)]
         if timing and len(timing) < len(choices[0]):  # they move the rows, and so change the likelihood of the starts
             begin = fit_terms(observations, timing, start, settings)
             fitted = {term.effect.name: term.values for term in begin.terms}
-            choices = [[replace(t, values=fitted.get(t.effect.name, t.values)) for t in each] for each in choices]
+            possible = [[replace(t, values=fitted.get(t.effect.name, t.values)) for t in each] for each in choices]
 
-        def likelihood(terms: Sequence[EffectColumns]) -> float:
+        def likelihood(terms: Terms) -> float:
             design = design_at(observations, _with_all_columns(begin, terms))
             return _solve(design, observations, settings).log_likelihood
 
-        chosen = choices[0] if len(choices) == 1 else max(choices, key=likelihood)
+        chosen = possible[0] if len(possible) == 1 else max(possible, key=likelihood)
         return fit_terms(observations, chosen, begin, settings)
 
-    key = fit_best, start.key, tuple(tuple(term.key for term in terms) for terms in combinations), tuple(settings)
+    key = fit_best, start.key, tuple(tuple(term.key for term in terms) for terms in choices), tuple(settings)
     return observations.once(key, best)
 
 

@@ -29,7 +29,7 @@ from pipeline.estimation.engine import ErrorMixture, draw_normal
 Draw = Callable[[np.random.Generator, int], Values]
 
 SEED = 101  # any number
-COVERAGE = 0.95  # probability of an interval
+INTERVAL_COVERAGE = 0.95  # probability of an interval
 BATCH = 500  # trials drawn at a time, which bounds the memory
 TWO_DIGITS = 1_000_000  # trials
 NEWTONS = 6  # each squares the relative error of a step; one by a wide prior starts at some 0.5
@@ -45,17 +45,15 @@ def numerical_tolerance(standard_uncertainty: ArrayLike, digits: int = 2) -> Val
     return np.asarray(0.5 * 10.0**exponent)
 
 
-def compared(
-    results: ArrayLike, estimate: ArrayLike, expanded_uncertainty: ArrayLike, *, digits: int = 2
-) -> MonteCarlo:
+def compared(results: ArrayLike, estimate: ArrayLike, expanded: ArrayLike, *, digits: int = 2) -> MonteCarlo:
     """Compare ``y +- U`` of n parameters by the law of propagation with the 95 % interval of (M, n) drawn results.
 
     The interval has as much probability below as above (7.7). A parameter without an uncertainty is confirmed.
     """
     values, y = np.sort(np.asarray(results, float), axis=0), np.atleast_1d(np.asarray(estimate, float))
-    U, u = np.atleast_1d(np.asarray(expanded_uncertainty, float)), values.std(axis=0, ddof=1)
+    U, u = np.atleast_1d(np.asarray(expanded, float)), values.std(axis=0, ddof=1)
     M, known = len(values), U > 0.0
-    inside = round(COVERAGE * M)
+    inside = round(INTERVAL_COVERAGE * M)
     first = (M - inside) // 2
     low, high = values[first], values[min(first + inside, M - 1)]
     tolerance = numerical_tolerance(np.minimum(u, U), digits)

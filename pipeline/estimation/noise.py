@@ -364,13 +364,11 @@ def _with_scatter(blocks: _RestBlocks, others: _RestBlocks) -> _RestBlocks:
     return _RestBlocks(**{**stacked, "scatter": blocks.scatter + others.scatter})
 
 
-def _likelihood(
-    blocks: _RestBlocks, design: Values, covariance: Values, correlation_times: Values
-) -> tuple[Values, Values]:
+def _likelihood(blocks: _RestBlocks, design: Values, covariance: Values, times: Values) -> tuple[Values, Values]:
     """Return the log likelihood and the white noise: (t, r, 3), by correlation time, ``SQRT_Q_GRID`` and axis.
 
     ``design``: (c, p), the nuisance columns d, at the c blocks that are ``cut``. ``covariance``: (l,), the filter's
-    autocovariance r. ``correlation_times``: (t,), s.
+    autocovariance r. ``times``: (t,), s, of correlation.
     """
     v = variance_of_mean(covariance, blocks.count)
     within = float(np.sum(blocks.count * (covariance[0] - v)))
@@ -378,15 +376,15 @@ def _likelihood(
     nu = max(float(np.sum(blocks.count - 1)) * correlated, 1e-9)
     cut = blocks.cut
     cut_blocks = Blocks(np.arange(cut.sum()), 1.0 / v[cut], blocks.start[cut], blocks.length[cut], blocks.clock[cut])
-    settings = [Setting(ratio, tau) for tau in correlation_times.tolist() for ratio in SQRT_Q_GRID.tolist()]
+    settings = [Setting(ratio, tau) for tau in times.tolist() for ratio in SQRT_Q_GRID.tolist()]
     basis = orthonormal(design, v[cut], MIN_NUISANCE_SINGULAR_VALUE)
     log_determinant, squares = GaussMarkov(cut_blocks, settings).restricted(basis, blocks.mean[cut])
-    inner = [np.sum(blocks.count * (1.0 - variance_of_average(blocks.length, tau))) for tau in correlation_times]
+    inner = [np.sum(blocks.count * (1.0 - variance_of_average(blocks.length, tau))) for tau in times]
     expected = within + np.outer(inner, SQRT_Q_GRID**2).ravel()
     free = len(cut_blocks.weight) - basis.shape[1] + nu
     variance = np.maximum((squares + nu * blocks.scatter / expected[:, None]) / free, 1e-18)
     log_likelihood = -0.5 * ((log_determinant + nu * np.log(expected))[:, None] + free * np.log(variance))
-    shape = (len(correlation_times), len(SQRT_Q_GRID), -1)
+    shape = (len(times), len(SQRT_Q_GRID), -1)
     return log_likelihood.reshape(shape), np.sqrt(variance).reshape(shape)
 
 
@@ -398,11 +396,9 @@ def noise_of(sensor: str, recordings: Sequence[Recording], data_sheet: DataSheet
         return None
 
 
-def with_noises(
-    recordings: Sequence[Recording], sensor_model: Sensor, sensors: Sequence[str] = SENSORS
-) -> UnitRecordings:
+def with_noises(recordings: Sequence[Recording], model: Sensor, sensors: Sequence[str] = SENSORS) -> UnitRecordings:
     """Return the recordings of a unit with the noise of its sensors."""
-    return UnitRecordings([*recordings], {s: noise_of(s, recordings, sensor_model.of(s)) for s in sensors})
+    return UnitRecordings([*recordings], {s: noise_of(s, recordings, model.of(s)) for s in sensors})
 
 
 def required_noises(

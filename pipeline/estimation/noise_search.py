@@ -210,7 +210,7 @@ def limits(spectrum: Spectrum, best: FittedComposition) -> Work[tuple[Values, di
         kinds, start = _with_term(best, kind, least[i], 0.0)
         step = float(np.log(((size[i] if gain[i] > 0.0 else 0.0) + ONE_SIDED * spread[i]) / least[i]))
         more = trial._replace(kinds=kinds, parameters=start)
-        works.append(_crossing(best, more, kinds.index(kind), step, one_sided=True))
+        works.append(_crossing(best, more, kinds.index(kind), step, upper=True))
     offsets = yield from at_once(works)
     within = np.full((2, 2 * n), np.nan)
     for (j, sign), offset in zip(sides, offsets, strict=False):
@@ -219,14 +219,12 @@ def limits(spectrum: Spectrum, best: FittedComposition) -> Work[tuple[Values, di
     return within, dict(zip(absent, upper.tolist(), strict=True))
 
 
-def _crossing(
-    best: FittedComposition, trial: TermTrial, j: int, step: float, *, one_sided: bool = False
-) -> Work[float]:
+def _crossing(best: FittedComposition, trial: TermTrial, j: int, step: float, *, upper: bool = False) -> Work[float]:
     """Return the change of parameter j at which -2 log L of the profile rises by the square of the quantile.
 
-    ``step``: a first guess.
+    ``step``: a first guess. ``upper``: of an upper limit, from one side.
     """
-    quantile, least = ONE_SIDED if one_sided else QUANTILE, float(best.fit.deviance[0])
+    quantile, least = ONE_SIDED if upper else QUANTILE, float(best.fit.deviance[0])
     sign, size = float(np.sign(step)), float(np.clip(abs(step), 1e-6, LARGEST_CHANGE))
     start, parameters = float(trial.parameters[j]), trial.parameters.copy()
     inner, outer = 0.0, np.inf
@@ -234,12 +232,12 @@ def _crossing(
         parameters[j] = start + sign * size
         fits = yield [trial._replace(parameters=parameters, held=j)]
         deviance = float(fits.deviance[0])
-        least = min(least, deviance) if one_sided else least
+        least = min(least, deviance) if upper else least
         excess = float(np.sqrt(max(deviance - least, 1e-12))) / quantile
         if abs(excess - 1.0) < PROFILE_PRECISE or (size >= LARGEST_CHANGE and excess < 1.0):
             break
         inner, outer = (size, outer) if excess <= 1.0 else (inner, size)
-        secant = size - np.log(excess) if one_sided else size / excess
+        secant = size - np.log(excess) if upper else size / excess
         guess = float(np.clip(secant, 0.3 * size, 3.0 * size))
         if not inner < guess < outer:
             guess = 0.5 * (inner + outer) if np.isfinite(outer) else min(2.0 * size, size + 2.0)

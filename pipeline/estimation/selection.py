@@ -24,7 +24,7 @@ from pipeline.core.errors import NotObservableError
 from pipeline.core.records import Noise, SensorCalibration, Values
 from pipeline.core.settings import DataSheet
 from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
-from pipeline.estimation.design import EffectColumns, Start, ordinary_base, placed, without_unknown_motion
+from pipeline.estimation.design import EffectColumns, Start, Terms, ordinary_base, placed, without_unknown_motion
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gates import MAX_FALSE_PROBABILITY, MIN_DELTA_BIC, passes
 from pipeline.estimation.gauss_markov import Setting, selection_grid
@@ -290,7 +290,7 @@ class Selection:
             self.fits[key] = self._fitted(key, terms, self.fit)
         self.fit = self.fits[key]
 
-    def _fitted(self, names: tuple[str, ...], terms: Sequence[EffectColumns], start: Start) -> JointFit:
+    def _fitted(self, names: tuple[str, ...], terms: Terms, start: Start) -> JointFit:
         """Fit terms from a start, or from the fit of the same effects that is known to be near."""
         if (near := self.near.get(names)) is not None:
             values = {term.effect.name: term.values for term in near.terms}

@@ -38,7 +38,7 @@ from pipeline.core.records import (
     Values,
 )
 from pipeline.core.settings import DataSheet, Settings, Table
-from pipeline.estimation.table_errors import TIME_BASE, type_b
+from pipeline.estimation.table_errors import TIME_BASE, BudgetLines, type_b
 from pipeline.estimation.uncertainty_budget import (
     GRAVITY,
     NOT_STATED,
@@ -97,18 +97,11 @@ def with_stated(
     return with_uncertainty(calibration, covariance, freedom, budget)
 
 
-def _rounding(
-    noise: Noise | None, calibration: SensorCalibration, recordings: Sequence[Recording]
-) -> list[Contribution]:
+def _rounding(noise: Noise | None, calibration: SensorCalibration, filtered: Sequence[Recording]) -> list[Contribution]:
     """Return the line of readings in steps that hide the noise; the gyroscope's fit to rests and moves contains it."""
-    by_moves = calibration.sensor == "gyroscope" and any(r.role == "rests" for r in recordings)
-    if (
-        noise is None
-        or noise.step is None
-        or noise.rounding is None
-        or by_moves
-        or any(line.source == QUANTISATION_SOURCE for line in calibration.lines)
-    ):
+    by_moves = calibration.sensor == "gyroscope" and any(r.role == "rests" for r in filtered)
+    known = by_moves or any(line.source == QUANTISATION_SOURCE for line in calibration.lines)
+    if noise is None or noise.step is None or noise.rounding is None or known:
         return []
     largest, unit = float(noise.rounding.max()), SENSOR_UNITS[calibration.sensor]
     effect = np.eye(len(calibration.parameters))[:, BIAS] * noise.rounding / largest
@@ -176,7 +169,7 @@ def _effects_on(calibration: SensorCalibration) -> list[tuple[str, str, Values]]
     return [("bias", SENSOR_UNITS[calibration.sensor], np.eye(size)[:, BIAS]), ("scale_factor", "1", of_scale)]
 
 
-def _repeatability(calibration: SensorCalibration, data_sheet: DataSheet) -> tuple[list[Contribution], dict[str, str]]:
+def _repeatability(calibration: SensorCalibration, data_sheet: DataSheet) -> BudgetLines:
     """Return the contributions of the repeatability, and the reason if it is not stated."""
     lines, lacking = [], []
     for name, unit, effect in _effects_on(calibration):

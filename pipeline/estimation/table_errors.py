@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import TypeAlias
 
 import numpy as np
 
@@ -33,6 +34,9 @@ from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import truth
 from pipeline.physics.kinematics import ABOUT, earth_of
 from pipeline.physics.signal.rests import RATE_AT_REST_DPS
+
+# contributions to a budget, and the reason for each source that is not included
+BudgetLines: TypeAlias = "tuple[list[Contribution], dict[str, str]]"
 
 INPUT_EFFECT_ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ
@@ -121,9 +125,7 @@ def _without_rounding(effect: Values) -> Values:
     return np.where(np.abs(effect) > INPUT_EFFECT_ROUNDING * np.abs(effect).max(initial=0.0), effect, 0.0)
 
 
-def table_errors(
-    reference: Reference, fit: LinearMap | BlockSums, estimated: Sequence[str] = ()
-) -> tuple[list[Contribution], dict[str, str]]:
+def table_errors(reference: Reference, fit: LinearMap | BlockSums, estimated: Sequence[str] = ()) -> BudgetLines:
     """Return the contribution of each stated accuracy to the parameters of a fit, and reasons for those not included.
 
     ``estimated``: effects of the fit; an error that one of them estimates is not an input any more.

@@ -70,7 +70,7 @@ from pipeline.core.records import (
 )
 from pipeline.core.settings import DataSheet, Settings, Table
 from pipeline.estimation.candidates import TILT, limits_of, tilt_like_zeros
-from pipeline.estimation.design import EffectColumns, columns_of_samples, joined_motions
+from pipeline.estimation.design import EffectColumns, Terms, columns_of_samples, joined_motions
 from pipeline.estimation.engine import LinearMap, ResidualNoise, scaled_inverse
 from pipeline.estimation.gauss_markov import WanderPrior
 from pipeline.estimation.monte_carlo import through, with_trials
@@ -78,7 +78,7 @@ from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
 from pipeline.estimation.multi_position.fit import FitByHand
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import Model, motion_at_rests
-from pipeline.estimation.table_errors import TIME_BASE, Reference, table_errors, type_b
+from pipeline.estimation.table_errors import TIME_BASE, BudgetLines, Reference, table_errors, type_b
 from pipeline.estimation.turns import RowGroups
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Effect, Layout, Owner
@@ -282,9 +282,7 @@ def scatter_contribution(
     return Contribution(NOISE_SOURCE, "A", "Student's t", covariance, freedom, parts=parts, remark=remark)
 
 
-def _quantisation(
-    noise: ResidualNoise, fit: LinearMap, counts_per_unit: float, unit: str
-) -> tuple[list[Contribution], dict[str, str]]:
+def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float, unit: str) -> BudgetLines:
     """Return the contribution of rounding to whole counts, or why it has no separate line.
 
     With white noise of half a count or more, the rounding errors of the samples are independent, of variance 1/12
@@ -301,7 +299,7 @@ def _quantisation(
     return [type_b(QUANTISATION_SOURCE, RECTANGULAR, u, unit, effect)], {}
 
 
-def gravity_line(calibration: SensorCalibration, table: Table) -> tuple[list[Contribution], dict[str, str]]:
+def gravity_line(calibration: SensorCalibration, table: Table) -> BudgetLines:
     """Return the contribution of local gravity, which scales the matrix, ``dM = M dG / G``, or why there is none."""
     u = table.gravity_accuracy_g
     if not u:
@@ -312,15 +310,15 @@ def gravity_line(calibration: SensorCalibration, table: Table) -> tuple[list[Con
 
 
 def clock_contribution(
-    calibration: SensorCalibration, ppm: float, distribution: str = NORMAL, remark: str = ""
+    calibration: SensorCalibration, ppm: float, kind: str = NORMAL, remark: str = ""
 ) -> Contribution:
     """Return the contribution of the sensor's clock, for rates that are an angle over its time: ``dM = M de``."""
     effect = np.zeros((len(calibration.parameters), 1))
     effect[MATRIX, 0] = 1e-6 * calibration.matrix.ravel()
-    return type_b(TIME_BASE, distribution, ppm, "ppm", effect, remark)
+    return type_b(TIME_BASE, kind, ppm, "ppm", effect, remark)
 
 
-def clock_line(calibration: SensorCalibration, table: Table) -> tuple[list[Contribution], dict[str, str]]:
+def clock_line(calibration: SensorCalibration, table: Table) -> BudgetLines:
     """Return the contribution of the sensor's clock as the table states it, or why there is none."""
     ppm = table.clock_accuracy_ppm
     if ppm is None:
@@ -329,24 +327,22 @@ def clock_line(calibration: SensorCalibration, table: Table) -> tuple[list[Contr
 
 
 def combined(
-    calibration: SensorCalibration, contributions: Sequence[Contribution], not_included: Mapping[str, str]
+    calibration: SensorCalibration, lines: Sequence[Contribution], missing: Mapping[str, str]
 ) -> SensorCalibration:
     """Return a calibration with the covariance and the degrees of freedom of all contributions together.
 
-    ``contributions``: to all of its parameters. ``not_included``: source to the reason why it is not included.
+    ``lines``: contributions to all of its parameters. ``missing``: source to the reason why it is not included.
     """
     parameters = calibration.parameters
     covariance, freedom = np.zeros((len(parameters),) * 2), np.full(len(parameters), np.inf)
-    if contributions:
-        covariance = np.sum([c.covariance for c in contributions], axis=0)
+    if lines:
+        covariance = np.sum([c.covariance for c in lines], axis=0)
         freedom = effective_degrees_of_freedom(
-            np.array([c.standard_uncertainty for c in contributions]),
-            np.array([c.degrees_of_freedom for c in contributions]),
+            np.array([c.standard_uncertainty for c in lines]), np.array([c.degrees_of_freedom for c in lines])
         )
-    reasons = {**not_included, "repeatability": f"{NOT_STATED}, and compare"}
-    lines = {c.source for c in contributions}
-    missing = tuple(NotIncluded(source, reason) for source, reason in reasons.items() if source not in lines)
-    return with_uncertainty(calibration, covariance, freedom, Budget(tuple(c.line() for c in contributions), missing))
+    reasons, sources = {**missing, "repeatability": f"{NOT_STATED}, and compare"}, {c.source for c in lines}
+    left_out = tuple(NotIncluded(source, reason) for source, reason in reasons.items() if source not in sources)
+    return with_uncertainty(calibration, covariance, freedom, Budget(tuple(c.line() for c in lines), left_out))
 
 
 def budgeted(  # noqa: PLR0917  (what a fit on a table is)
@@ -371,7 +367,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     if TILT in estimated and tilt_like_zeros(reference.motions, estimated) is not None:
         absent["levelling"] = ACROSS
 
-    def rounding(fit: LinearMap) -> tuple[list[Contribution], dict[str, str]]:
+    def rounding(fit: LinearMap) -> BudgetLines:
         if joint:
             return [], {QUANTISATION_SOURCE: f"contained in the {NOISE_SOURCE}"}
         return _quantisation(noise, fit, counts, SENSOR_UNITS[sensor])
@@ -434,7 +430,7 @@ def base_parameters(sensor: str, bias: Values, matrix: Values, covariance: Value
 
 
 def effect_parameters(
-    sensor: str, terms: Sequence[EffectColumns], covariance: Values
+    sensor: str, terms: Terms, covariance: Values
 ) -> tuple[tuple[FittedEffect, ...], dict[str, Estimate]]:
     """Return the fitted effects, and their parameters as those of a stage; they follow bias and matrix."""
     u = iter(standard_uncertainty(covariance)[AFTER_BASE].tolist())

@@ -41,7 +41,7 @@ import scipy
 
 from pipeline.core.records import BASE_COUNT, Mask, Motion, Noise, Recording, SensorCalibration, Values
 from pipeline.core.settings import DataSheet, Settings
-from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.design import EffectColumns, Terms
 from pipeline.estimation.multi_position.faces_and_turns import Faces, faces_of
 from pipeline.estimation.multi_position.model import (
     EquationBlock,
@@ -135,7 +135,7 @@ class AccelerometerModel:
         )
         self.stretches = start, length, recording
 
-    def equations(self, state: State, candidates: Sequence[EffectColumns] = ()) -> Equations:
+    def equations(self, state: State, candidates: Terms = ()) -> Equations:
         """Return the linearised equations at given parameters."""
         rests = self.rests
         force, v = self.specific_force(state, rests)

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -50,6 +50,9 @@ NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip
 DEPARTS = 4.5  # standard uncertainties: two angles exceed it with a probability of 4e-5
 ONE_LINE = 1.0 - 1e-9  # cosine of the angle between axes that are stated as the same
 FACES = [f"{sign}{axis}" for axis in AXES for sign in "+-"]
+
+
+HandMove: TypeAlias = "tuple[Recording, float, Values]"  # recording, start, s, and integrated readings, deg
 
 
 class StatedTurn(NamedTuple):
@@ -73,12 +76,11 @@ def name_of_axis(direction: Values) -> str:
 
 def _multiples(
     recordings: Sequence[Recording], rests: Rests, bias: Values, turns: HandTurns, role: str
-) -> tuple[list[StatedTurn], list[tuple[Recording, float, Values]]]:
+) -> tuple[list[StatedTurn], list[HandMove]]:
     """Return the moves that are turns by a multiple of the stated angle, and all moves.
 
     A move is from one rest to the next of its recording, unless it ends at a held-out rest. A recording that the
-    procedure states as a turn about an axis is one move if it has no move between two rests. A move is its recording,
-    start in s and integrated readings in deg.
+    procedure states as a turn about an axis is one move if it has no move between two rests.
     """
     spans = [(int(rests.recording[j]), span) for _, j, span in spans_between(rests) if not rests.held_out[j]]
     bounded = {index for index, _ in spans}
@@ -183,9 +185,7 @@ def _integral(recording: Recording, span: slice, bias: Values) -> Values:
     return np.asarray(np.trapezoid(rate, recording.time[span], axis=0), np.float64)
 
 
-def require_turns(
-    found: Sequence[tuple[str, str]], moves: Sequence[tuple[Recording, float, Values]], turns: HandTurns
-) -> None:
+def require_turns(found: Sequence[tuple[str, str]], moves: Sequence[HandMove], turns: HandTurns) -> None:
     """Raise ``CannotCalibrateError`` if an axis has no stated turn, or a recording of a turn has another turn.
 
     ``found``: recording and axis of each turn.

@@ -41,7 +41,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
-from typing import TYPE_CHECKING
+from typing import TypeAlias
 
 import numpy as np
 import scipy
@@ -53,8 +53,8 @@ from pipeline.estimation.design import placed
 from pipeline.estimation.engine import ErrorMixture
 from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, stepped
 
-if TYPE_CHECKING:
-    Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
+Limits: TypeAlias = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
+Hypotheses: TypeAlias = Sequence[NoiseHypothesis]
 
 # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 MAX_STEP_HALVINGS = 30  # of a step; a smaller one is rounding
@@ -83,9 +83,7 @@ def log_likelihood(rss: Values, n: int, log_determinant: Values) -> Values:
     return np.asarray(-0.5 * (rss / k + n * np.log(k) + log_determinant))
 
 
-def log_likelihoods(
-    equations: Equations, hypotheses: Sequence[NoiseHypothesis], predicted: Values | None = None
-) -> Values:
+def log_likelihoods(equations: Equations, hypotheses: Hypotheses, predicted: Values | None = None) -> Values:
     """Return log L of the model under each hypothesis: (t,) array.
 
     ``predicted``: (t,), by a linear model. Then log L is computed only where it may be within
@@ -105,7 +103,7 @@ def log_likelihoods(
         scores[chosen], still[chosen], best = found, False, max(best, float(found.max()))
 
 
-def _log_likelihoods(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -> Values:
+def _log_likelihoods(equations: Equations, hypotheses: Hypotheses) -> Values:
     together = np.concatenate([equations.columns, equations.residual[:, None]], axis=1)
     whitened = [equations.whitened(noise, together) for noise in hypotheses]
     products = np.array([white.T @ white for white, _ in whitened])
@@ -189,7 +187,7 @@ def log_determinants(products: Values) -> tuple[Values, int]:
     return np.asarray(logarithm + 2.0 * np.sum(np.log(size), axis=1)), rank
 
 
-def project_out(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -> ProjectedCandidates:
+def project_out(equations: Equations, hypotheses: Hypotheses) -> ProjectedCandidates:
     """Whiten the equations under every hypothesis and project the model's columns out of candidates and residual."""
     model = equations.columns
     together = np.concatenate([model, *equations.candidates, equations.residual[:, None]], axis=1)
@@ -208,7 +206,7 @@ def project_out(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -> 
     return ProjectedCandidates(raw, factors, rest[:, :, -1], basis, log_determinant)
 
 
-def judged_curves(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -> list[tuple[float, float]]:
+def judged_curves(equations: Equations, hypotheses: Hypotheses) -> list[tuple[float, float]]:
     """Return delta BIC of each candidate, and p averaged over the hypotheses."""
     projected, n = project_out(equations, hypotheses), len(equations.residual)
     before, (best, at) = projected.scores(), projected.of_model()
@@ -359,7 +357,7 @@ class Solution:
 def fit(
     model: Model,
     start: State,
-    hypotheses: Sequence[NoiseHypothesis],
+    hypotheses: Hypotheses,
     limits: Limits,
     freedom: float | None = None,
     *,
@@ -449,9 +447,7 @@ def _prior(model: Model, state: State, limits: Limits) -> tuple[Values, Values]:
     return np.concatenate(precision), np.concatenate(values)
 
 
-def refined(
-    equations: Equations, near: Sequence[NoiseHypothesis], prior: tuple[Values, Values]
-) -> list[NoiseHypothesis]:
+def refined(equations: Equations, near: Hypotheses, prior: tuple[Values, Values]) -> list[NoiseHypothesis]:
     """Return the hypotheses with significant weight; ``near``: those of a grid whose likelihood is not negligible.
 
     Many moves determine their scatter to about a tenth; a grid with factors of 3 or 4 would make the covariance wrong

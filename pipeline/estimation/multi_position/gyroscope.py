@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
     from pipeline.core.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
     from pipeline.core.settings import Procedure
-    from pipeline.estimation.design import EffectColumns
+    from pipeline.estimation.design import EffectColumns, Terms
     from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.rest_means import Rests
 
@@ -104,7 +104,7 @@ class GyroscopeModel:
             self.before, self.after = gravity.at_end[self.moves.before], gravity.at_start[self.moves.after]
             self.excess = np.zeros(self.moves.count)  # deg^2, variance of a further independent error of each move
 
-    def equations(self, state: State, candidates: Sequence[EffectColumns] = ()) -> Equations:
+    def equations(self, state: State, candidates: Terms = ()) -> Equations:
         """Return the linearised equations at given parameters."""
         blocks = [self._at_rest(state)]
         if self.moves is not None:

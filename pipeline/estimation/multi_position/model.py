@@ -40,7 +40,7 @@ import scipy
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.core.records import BIAS, Index, Mask, Motion, Noise, Values, base_values, matrix_of
 from pipeline.estimation import design
-from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.design import EffectColumns, Terms
 from pipeline.estimation.engine import cholesky
 from pipeline.estimation.gauss_markov import NO_INSTABILITY_ODDS, Setting, WanderPrior, block_covariance, selection_grid
 from pipeline.estimation.rest_means import Rests
@@ -223,9 +223,7 @@ class EquationBlock:
     stated: bool = False  # whether they are pseudo-observations of limits; the last block
 
 
-def stacked(
-    blocks: Sequence[EquationBlock], model: Model, state: State, candidates: Sequence[EffectColumns]
-) -> Equations:
+def stacked(blocks: Sequence[EquationBlock], model: Model, state: State, candidates: Terms) -> Equations:
     """Stack blocks of equations; the block of the rests is the first.
 
     Blocks beyond the kinds of scatter, as the parts of soaks, share the last kind.
@@ -319,7 +317,7 @@ def motion_of(part: Rests | Moves | TurnsByHand, force: Values, rate: Values, *,
     )
 
 
-def effect_readings(sensor: str, terms: Sequence[EffectColumns], motion: Motion, K: Values) -> Values:
+def effect_readings(sensor: str, terms: Terms, motion: Motion, K: Values) -> Values:
     """Return what effects add to the readings: (n, 3) array."""
     readings = (term.effect.reading(sensor, motion, K, term.values) for term in terms)
     return np.asarray(sum(readings, np.zeros_like(motion.specific_force)))
@@ -376,13 +374,11 @@ def limit_block(known: Mapping[str, float], columns: Values, state: State, unit:
     )
 
 
-def with_limits(
-    limits: Mapping[str, float], solve_with: Callable[[Mapping[str, float]], tuple[Fitted, Values]]
-) -> Fitted:
+def with_limits(limits: Mapping[str, float], solve: Callable[[Mapping[str, float]], tuple[Fitted, Values]]) -> Fitted:
     """Fit with pseudo-observations of those parameters that the recordings determine worse than the sensor file.
 
     A parameter keeps its pseudo-observation where its variance is more than half of that of its limit, or without one
-    more than all of it: it is then mostly the limit's. ``limits``: name to standard uncertainty. ``solve_with``: fits
+    more than all of it: it is then mostly the limit's. ``limits``: name to standard uncertainty. ``solve``: fits
     with some of them, and returns the fit and the standard uncertainties of all; raises an error if they leave a
     combination open.
     """
@@ -391,11 +387,11 @@ def with_limits(
     def held(kept: Mask) -> Mapping[str, float]:
         return {name: limit for name, limit, k in zip(limits, u.tolist(), kept, strict=True) if k}
 
-    every, known = solve_with(held(np.ones(len(u), bool)))
+    every, known = solve(held(np.ones(len(u), bool)))
     kept = known > u * np.sqrt(0.5)
     while not kept.all():
         try:
-            found, known_now = solve_with(held(kept))
+            found, known_now = solve(held(kept))
         except (NotObservableError, CannotCalibrateError):
             known_now = known
         else:

@@ -23,7 +23,7 @@ import scipy
 from pipeline.core.records import Mask, Motion, Noise, SensorCalibration, Values
 from pipeline.core.settings import DataSheet
 from pipeline.estimation.candidates import NO_SWING, limits_of, starts_of, time_constants
-from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.design import EffectColumns, Terms
 from pipeline.estimation.evidence import CandidateProblem, linear_problem
 from pipeline.estimation.gates import MIN_DELTA_BIC, passes
 from pipeline.estimation.gauss_markov import random_walks
@@ -331,7 +331,7 @@ class CommonLag(Effect):
 
     name, owner, layout = "a lag common to all axes", Owner.SENSOR, Layout.SHARED
 
-    def __init__(self, terms: Sequence[EffectColumns]) -> None:
+    def __init__(self, terms: Terms) -> None:
         self.terms = terms
 
     def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
@@ -350,7 +350,7 @@ class CommonLag(Effect):
         return np.asarray((change * motion.temperature_rate[:, None])[:, :, None])
 
 
-def loops_of(model: Model, terms: Sequence[EffectColumns]) -> list[EffectColumns]:
+def loops_of(model: Model, terms: Terms) -> list[EffectColumns]:
     """Return the curves of soaks that heat and cool, given effects: hysteresis, with the sign of dT/dt, and lag."""
     rate = (getattr(model, "soaks", None) or model.rests.select(model.rests.soaked)).temperature_rate
     cold = np.isnan(model.rests.temperature_rate).any()  # some recording holds no temperature
