@@ -77,8 +77,7 @@ from pipeline.physics.statements import not_determined
 
 EARTH = "earth_rotation"
 OTHER_FILE = "check that the sensor's file is that of this unit, and that its range and units are right"
-# an accelerometer whose mountings may be wrong
-IN_DOUBT = Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED
+IN_DOUBT = Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED  # of an accelerometer whose mountings may be wrong
 LEANING = ("mounting", "table_axis_nonorthogonality")  # effects that tilt a turn axis in the body
 # errors of a method that its uncertainty excludes
 ERRORS_OUTSIDE_UNCERTAINTY = ("bias", "scale_factor", "non_orthogonality", "rotation")
@@ -111,9 +110,7 @@ def without_impossible(found: SensorDiagnosis, case: DiagnosisInput) -> SensorDi
     reasons = {entry.effect: reason for entry in found.chosen if (reason := _contradiction(entry, case))}
     if not reasons:
         return found
-    told = "; ".join(
-        f"{plain(name)} fits the residual best and is no cause: {reason}" for name, reason in reasons.items()
-    )
+    told = "; ".join(f"{plain(name)} fits the residual best and is no cause: {why}" for name, why in reasons.items())
     doubted = found.verdict == Verdict.REFERENCE_IN_DOUBT
     return replace(
         found,
@@ -377,8 +374,7 @@ def without_diagnosis(sensor: str, effects: Effects, code: str, message: str) ->
 
     The verdict is ``not_enough_data``, because nothing is known of what is missing.
     """
-    listed = effects.of(sensor)
-    bug = code == "internal_error"
+    listed, bug = effects.of(sensor), code == "internal_error"
     remedy = "report this fault with the traceback, which is in the log of the stage diagnose" if bug else ""
     found = _not_enough_data(sensor, [] if listed == AUTO else list(listed), "", remedy)
     reason = f"The diagnosis failed: {message}. The calibration does not depend on it."
@@ -429,9 +425,8 @@ def effective_noise(
             continue
         shares = [{"effect": name, "density": _density(error, time)} for name, error in of_effects.items()]
         ratio = density / white if white > 0 else None
-        densities.append(
-            {"averaging_time_s": round(time, 9), "density": density, "over_white": ratio, "effects": shares}
-        )
+        entry = {"averaging_time_s": round(time, 9), "density": density, "over_white": ratio, "effects": shares}
+        densities.append(entry)
     if not densities:
         return None
     return {

@@ -118,10 +118,8 @@ def significant(tests: Iterable[tuple[str, float, float]]) -> dict[str, tuple[fl
 def _significant(selection: Selection, explained: Curves | None) -> dict[str, tuple[float, float]]:
     """Return the significant covariates of a selection; see ``significant``."""
     scan, bases = Scan(selection, explained), _bases_of(selection)
-    tests = [_tests_of_curves(bases, scan)]
-    if selection.names or selection.fit.residual_rms > RESIDUAL_OVER_NOISE * float(
-        np.sqrt(np.mean(selection.start.scale**2))
-    ):
+    tests, white = [_tests_of_curves(bases, scan)], float(np.sqrt(np.mean(selection.start.scale**2)))
+    if selection.names or selection.fit.residual_rms > RESIDUAL_OVER_NOISE * white:
         tests.append(_tests_of_steps(selection, [covariate for covariate, _, _ in bases], scan))
     names = [name for of_kind, _, _ in tests for name in of_kind]
     delta, parameters = (np.concatenate([test[k] for test in tests]) for k in (1, 2))
@@ -155,9 +153,8 @@ def _tests_of_steps(selection: Selection, covariates: Sequence[str], scan: Scan)
             scanned.append((signal, places[every // 2 :: every]))
             names += [covariate] * 2 * len(scanned[-1][1])
     steps = len(names)
-    ripples = (
-        (MAX_CURVE_CYCLES - LEAST_RIPPLE + 1) if observations.sensor == "gyroscope" and "angle" in covariates else 0
-    )
+    rippled = observations.sensor == "gyroscope" and "angle" in covariates
+    ripples = MAX_CURVE_CYCLES - LEAST_RIPPLE + 1 if rippled else 0
 
     def curves(motion: Motion) -> Values:
         signals, columns = signals_of(motion), []
@@ -348,15 +345,13 @@ def added_variable_of_rests(selection: by_hand.SelectionByHand) -> JSON | None:
         if np.sum(x[rests] ** 2) < MIN_REST_POWER_SHARE * np.sum(x**2):
             return None
         order = np.argsort(x[rests], kind="stable")
-        panels.append(
-            {
-                "axis": "xyz"[c],
-                **_coefficient(term, model.sensor, j, uncertainty[j]),
-                "x": (x[rests] * size)[order].tolist(),
-                "mean": ((term.values[j] * x + white[:, -1])[rests] * size)[order].tolist(),
-                "standard_error": [size * float(np.sqrt(scale))] * len(order),
-            }
-        )
+        panels.append({
+            "axis": "xyz"[c],
+            **_coefficient(term, model.sensor, j, uncertainty[j]),
+            "x": (x[rests] * size)[order].tolist(),
+            "mean": ((term.values[j] * x + white[:, -1])[rests] * size)[order].tolist(),
+            "standard_error": [size * float(np.sqrt(scale))] * len(order),
+        })  # fmt: skip
     return {"effect": selection.names[0], "unit": unit_of(model.sensor), "panels": panels}
 
 
@@ -510,11 +505,8 @@ class Bins:
 
     def document(self, values: Values, variance: Values) -> dict[str, list[float]]:
         """Return covariate, means of (n,) values and their standard errors as lists."""
-        return {
-            "x": _rounded(self.centre),
-            "mean": _rounded(self.mean(values)),
-            "standard_error": _rounded(np.sqrt(variance)),
-        }
+        columns = {"x": self.centre, "mean": self.mean(values), "standard_error": np.sqrt(variance)}
+        return {name: _rounded(column) for name, column in columns.items()}
 
 
 def _rounded(values: Values) -> list[float]:

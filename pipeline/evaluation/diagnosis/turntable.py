@@ -70,9 +70,8 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
     slices = placed(fit.terms)
     design = fit.design(observations)
     products = design.products([fit.setting])[0]
-    without_each = [
-        (design.reweighted(rest).products([fit.setting])[0], rest) for rest in without_each_recording(observations)
-    ]
+    rests = without_each_recording(observations)
+    without_each = [(design.reweighted(rest).products([fit.setting])[0], rest) for rest in rests]
     ends = np.cumsum([len(part.weight) for part in observations.parts])
     of_block = np.searchsorted(ends, observations.blocks.first, side="right")  # index of the recording
     found = []

@@ -92,8 +92,8 @@ class VerdictInput:
     fit: FitStage = field(default_factory=FitStage)  # last stage of the method
     as_printed: bool = False  # whether the method uses the equations of the thesis as printed
     filtered: bool = False
-    # parameters that the sensor file's limits determine, and what would; of a sheet, or of a stage that keeps them
     likely: Sequence[str] = ()  # the most probable effects, if the 95 % answer set lacks that nothing is missing
+    # parameters that the sensor file's limits determine, and what would; of a sheet, or of a stage that keeps them
     held_by_limit: str = ""
     on_table: bool = True  # a few rests by hand may have a small residual by chance
 

@@ -177,9 +177,8 @@ def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]
     import imufusion  # noqa: PLC0415  (only units with a logged attitude need it)
 
     turns = angle_between(alone[:, :-1], alone[:, 1:])
-    within = min(
-        MAX_FILTER_STEP_S / float(np.median(np.diff(time))), MAX_FILTER_STEP_DEG / max(float(turns.max()), 1e-9)
-    )
+    interval, largest = float(np.median(np.diff(time))), max(float(turns.max()), 1e-9)
+    within = min(MAX_FILTER_STEP_S / interval, MAX_FILTER_STEP_DEG / largest)
     chosen = np.arange(0, len(time), max(1, int(within)))
     intervals = np.diff(time[chosen])
     w, *v = _between(alone[:, chosen[:-1]], alone[:, chosen[1:]])
@@ -303,9 +302,8 @@ def held_out_turns(
     rests = rests or rests_of("gyroscope", recordings, procedure)
     if rests is None:
         return [], ()
-    turns = turns_of(
-        recordings, replace(rests, held_out=np.zeros(len(rests.time), bool)), accelerometer, procedure, HELD_OUT
-    )
+    used = replace(rests, held_out=np.zeros(len(rests.time), bool))
+    turns = turns_of(recordings, used, accelerometer, procedure, HELD_OUT)
     if turns is None:
         return [], ()
     states = {"before": State(np.zeros(3), np.eye(3)), "after": _state(gyroscope)}
@@ -322,8 +320,5 @@ def held_out_turns(
 
 
 def _state(calibration: SensorCalibration) -> State:
-    return State(
-        calibration.bias,
-        calibration.matrix,
-        tuple(EffectColumns(effect(e.name), e.values) for e in calibration.effects),
-    )
+    terms = tuple(EffectColumns(effect(e.name), e.values) for e in calibration.effects)
+    return State(calibration.bias, calibration.matrix, terms)

@@ -121,9 +121,8 @@ class HeldOutCase:
         found = self._in_motion("validation", smoothed=smoothed)
         if found or not self.by_hand:
             return found
-        return self.at_rests(held_out_rests(self.recordings, self.settings.procedure)) or self._at_rests_of(
-            "validation"
-        )
+        held_out = held_out_rests(self.recordings, self.settings.procedure)
+        return self.at_rests(held_out) or self._at_rests_of("validation")
 
     def fit_samples(self, *, followed: bool = True) -> list[Samples]:
         """Return the samples that the fit used; ``followed``: see ``samples_of_motion``."""
@@ -267,9 +266,8 @@ def reference_vector(calibration: SensorCalibration, samples: Samples) -> Values
 
 def _creep(recording: Recording, rests: Sequence[Rest], force: Values) -> tuple[Values, Values]:
     """Return the rate at which the unit creeps in each rest, deg/s, and the variance of its error."""
-    creeps = {
-        (r.start, r.stop): creep_of_rest(recording, r.start, r.stop) for r in (*split_rests(recording, 0).used, *rests)
-    }
+    every = *split_rests(recording, 0).used, *rests
+    creeps = {(r.start, r.stop): creep_of_rest(recording, r.start, r.stop) for r in every}
     rates, errors, about_gravity = posterior_creep_rates(list(creeps.values()))
     chosen = [list(creeps).index((rest.start, rest.stop)) for rest in rests]
     rate, error = rates[chosen], errors[chosen]

@@ -137,9 +137,8 @@ def validate(
     if not samples:
         reason = _why_not_held_out(case)
         if count := _fitted_exactly(calibration):
-            reason += (
-                f"; the fit passes through its {count} rests exactly, so that their error does not test it: record more"
-            )
+            exactly = f"the fit passes through its {count} rests exactly"
+            reason += f"; {exactly}, so that their error does not test it: record more"
         elif samples := case.fit_samples():
             reason += "; judged on the samples of the fit"
     count = int(sum(s.known.sum() for s in samples))
