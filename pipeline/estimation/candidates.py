@@ -71,19 +71,16 @@ def starts_of(
     if len(set(names)) != len(names):
         raise ConfigurationError(f"effects.{sensor} names an effect twice: {', '.join(names)}")
     for name in names:
-        within = [n for n in effect(name).contains if n in names]
-        if within:
-            raise ConfigurationError(
-                f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them"
-            )
+        if within := [n for n in effect(name).contains if n in names]:
+            both = f"{name} and {within[0]}"
+            raise ConfigurationError(f"effects.{sensor} names {both}, which it contains: name one of them")
     fitted = {} if known is None else {e.name: e.values for e in known.effects}
     choices: list[list[EffectColumns]] = []
     for name in names:
         this = effect(name).of_recordings(recordings)
         if sensor not in this.sensors:
-            raise ConfigurationError(
-                f"effects.{sensor} names {name}, which is an effect of the {this.sensors[0]} alone"
-            )
+            owner = this.sensors[0]
+            raise ConfigurationError(f"effects.{sensor} names {name}, which is an effect of the {owner} alone")
         prior = None if isinstance(observed, str) else prior_of(this, observed, accelerometer, names)
         starts = this.starts(sensor) if prior is None or this.nonlinear else [prior.mean]
         if name in fitted and len(fitted[name]) == len(this.parameters(sensor)):
@@ -172,13 +169,9 @@ def offered(names: Sequence[str], terms: Terms, covariance: Values, data_sheet: 
     """
     limits, base = limits_of(sensor, data_sheet), len(covariance) - sum(len(term.values) for term in terms)
     u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    found = placed(terms, base)
-    impossible = [
-        name
-        for name in names
-        if name in limits and not possible(found[name][0].values, u[found[name][1]], limits[name])
-    ]
-    return [] if impossible and not data_sheet.accept_implausible else list(names)
+    found = [(limits[name], *placed(terms, base)[name]) for name in names if name in limits]
+    every = all(possible(term.values, u[at], limit) for limit, term, at in found)
+    return list(names) if every or data_sheet.accept_implausible else []
 
 
 def candidates_for(observations: Observations, configured: Sequence[str]) -> list[Effect]:

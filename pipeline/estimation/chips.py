@@ -418,10 +418,8 @@ def _errors(fitted: RotationFits, chips: tuple[Chip, Chip]) -> list[ChipError]:
                 both = [(E, E) for E in shears]
                 sources.append((f"stated accuracies of the bench, {of}s", "B", np.inf, of_bench, both))
         for source, kind, degrees, covariance, pairs in sources:
-            of_fits = [
-                np.concatenate([fit.map.of(_change(fitted, fit, of, *E))[k] for fit, k in zip(fits, kept, strict=True)])
-                for E in pairs
-            ]
+            every = list(zip(fits, kept, strict=True))
+            of_fits = [np.concatenate([fit.map.of(_change(fitted, fit, of, *E))[k] for fit, k in every]) for E in pairs]
             of_axes = np.zeros((3, 9))
             for column, (E_a, E_b) in enumerate(pairs if of == "accelerometer" else []):
                 less, more = (axes_between(chips, R, step * E_a, step * E_b) for step in (-SHEAR, SHEAR))
@@ -454,10 +452,8 @@ def axes_of(matrix: Values) -> Values:
 
 def axes_between(chips: Sequence[Chip], R: Values, E_a: Values, E_b: Values) -> Values:
     """Return the rotation from the axes of a to those of b, where the accelerometers' truths are sheared."""
-    a, b = (
-        axes_of((np.eye(3) + E) @ calibration.matrix)
-        for E, calibration in zip((E_a, R @ E_b @ R.T), _accelerometers(chips), strict=True)
-    )
+    pairs = zip((E_a, R @ E_b @ R.T), _accelerometers(chips), strict=True)
+    a, b = (axes_of((np.eye(3) + E) @ calibration.matrix) for E, calibration in pairs)
     return np.asarray(b @ R @ a.T)
 
 

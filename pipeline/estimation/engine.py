@@ -179,10 +179,8 @@ def _within(weight: Values, sigma: Values, probability: float) -> Values:
 def _quantiles() -> tuple[Values, Values, Values]:
     """Return 1 / nu, the ratio of both quantiles of Student's t, and the outer one: (k,) arrays."""
     inverse = np.linspace(0.0, 1.0 / MIN_DEGREES_OF_FREEDOM, 101)
-    inner, outer = (
-        np.append(scipy.special.ndtri(upper), scipy.special.stdtrit(1.0 / inverse[1:], upper))
-        for upper in (0.5 + ONE_SIGMA / 2.0, 0.5 + COVERED / 2.0)
-    )
+    special, levels = scipy.special, (0.5 + ONE_SIGMA / 2.0, 0.5 + COVERED / 2.0)
+    inner, outer = (np.append(special.ndtri(p), special.stdtrit(1.0 / inverse[1:], p)) for p in levels)
     return inverse, np.asarray(outer / inner, np.float64), np.asarray(outer, np.float64)
 
 

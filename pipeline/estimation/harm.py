@@ -181,10 +181,8 @@ def left_out(
         judged.append(equations >= each.rank + SPARE)
         if equations <= each.rank:
             continue
-        fits = [
-            known(k, count) or fit(part, each.state, selection.hypotheses, selection.bounds, small=COMPARED_STEP)
-            for k, part in enumerate(models)
-        ]
+        given = each.state, selection.hypotheses, selection.bounds
+        fits = [known(k, count) or fit(part, *given, small=COMPARED_STEP) for k, part in enumerate(models)]
         rests.append(np.concatenate([_at_rests(model, part, f) for part, f in zip(models, fits, strict=True)]))
         if moving:
             errors = [part.direction_errors(f.state)[0] for part, f in zip(others, fits, strict=True)]

@@ -170,13 +170,7 @@ def with_prior(x: Values, own: Values, predicted: Prediction, known: Mask) -> Wi
     gain = own[:, known] @ scaled_inverse(own[np.ix_(known, known)] + np.diag(variance))
     rest = np.eye(len(x))
     rest[:, known] -= gain
-    lines = np.abs(gain * np.sqrt(variance)).T
-    share = np.zeros(len(x))
+    share, lot_freedom = np.zeros(len(x)), effective_degrees_of_freedom(np.abs(gain * np.sqrt(variance)).T, freedom)
     share[known] = np.diag(gain[known])
-    return WithPrior(
-        x - gain @ (x[known] - mean),
-        rest @ own @ rest.T,
-        (gain * variance) @ gain.T,
-        effective_degrees_of_freedom(lines, freedom),
-        share,
-    )
+    values, by_own, by_lot = x - gain @ (x[known] - mean), rest @ own @ rest.T, (gain * variance) @ gain.T
+    return WithPrior(values, by_own, by_lot, lot_freedom, share)

@@ -251,10 +251,9 @@ def _axes(regressions: Sequence[Regression]) -> list[JSON]:
     longest = [max(r.stretches, key=lambda s: len(s.time)).reading[:, r.column] for r in regressions]
     tau, measured = allan_deviation(np.stack(longest, axis=1), spectrum.interval, AVERAGES_PER_DECADE)
     shown = tau <= LONGEST_AVERAGE_SHARE * len(longest[0]) * spectrum.interval
-    return [
-        _axis(r, s, candidate, bound, (tau[shown], curve[shown]))
-        for (s, r), candidate, bound, curve in zip(pairs, best, bounds, measured.T, strict=True)
-    ]
+    curves = [(tau[shown], curve[shown]) for curve in measured.T]
+    of_axes = zip(pairs, best, bounds, curves, strict=True)
+    return [_axis(r, s, candidate, bound, curve) for (s, r), candidate, bound, curve in of_axes]
 
 
 def _axis(
@@ -285,10 +284,8 @@ def _axis(
         reason = _reason(kind, regression.names(best), spectrum)
         terms[name] = seen.get(name) or UnseenTerm(unit_of(name, unit), reason, limit)
     processes = [(term.correlation_time_s.value, term) for term in present if term.correlation_time_s]
-    slopes = {
-        "ramp": _slope(regression, best, spectrum, "ramp", regression.span),
-        "temperature": _slope(regression, best, spectrum, "temperature", 1.0),
-    }
+    per = {"ramp": regression.span, "temperature": 1.0}
+    slopes = {name: _slope(regression, best, spectrum, name, size) for name, size in per.items()}
     sinusoids = _sinusoids(regression, best)
     others = [*(s for s in slopes.values() if isinstance(s, SeenTerm) and s.name == "ramp"), *sinusoids]
     return {
@@ -414,15 +411,9 @@ def _allan(  # noqa: PLR0917  (the curve and its terms)
     for coefficient, part in others:  # by the interval of the coefficient
         low, high = coefficient.interval or (np.nan, np.nan)
         variance += (part / total * (high - low) / coefficient.value / QUANTILE) ** 2
-    half, deviation = QUANTILE * np.sqrt(variance), np.sqrt(total)
-    curves = {
-        "tau_s": tau,
-        "deviation": measured,
-        "fit": deviation,
-        "low": deviation * np.exp(-0.5 * half),
-        "high": deviation * np.exp(0.5 * half),
-    }
-    return _rounded(curves)
+    half, fit = 0.5 * QUANTILE * np.sqrt(variance), np.sqrt(total)
+    band = {"low": fit * np.exp(-half), "high": fit * np.exp(half)}
+    return _rounded({"tau_s": tau, "deviation": measured, "fit": fit, **band})
 
 
 def _rounded(curves: Mapping[str, Values]) -> JSON:

@@ -184,10 +184,8 @@ class Spectrum:
 
 def spectrum_of(stretches: Sequence[Values], interval: float) -> Spectrum:
     """Return the spectrum of stretches of samples: (a, n, c) arrays, readings first, then deterministic columns."""
-    rows = [
-        scipy.fft.dct(values - values.mean(axis=1, keepdims=True), axis=1, norm="ortho", overwrite_x=True)[:, 1:]
-        for values in stretches
-    ]
+    centred = (values - values.mean(axis=1, keepdims=True) for values in stretches)
+    rows = [scipy.fft.dct(values, axis=1, norm="ortho", overwrite_x=True)[:, 1:] for values in centred]
     w = np.concatenate([np.pi * np.arange(1, values.shape[1]) / values.shape[1] for values in stretches])
     y = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
     if len(stretches) > 1:

@@ -122,11 +122,8 @@ def _reason(this: Effect, selection: Selection) -> str:
     """Return why turns cannot show an effect; empty if they can."""
     observations, excited = selection.observations, selection.first.indices(this.name)
     motions = [part.motion for part in observations.parts]
-    lacking = [
-        text
-        for need, text in OF_A_TABLE.items()
-        if need in this.needs and all(getattr(motion, need) is None for motion in motions)
-    ]
+    needed = [(need, text) for need, text in OF_A_TABLE.items() if need in this.needs]
+    lacking = [text for need, text in needed if all(getattr(motion, need) is None for motion in motions)]
     warm = "temperature" in this.needs
     warmth = [motion.temperature for motion in motions]
     known = [t for t in warmth if t is not None]

@@ -276,11 +276,8 @@ def rests_of(
     out; ``static``; or ``validation``, whose rests are all held out.
     """
     every = holdout_interval(recordings, procedure) if role == ROLE else 0
-    refused = {
-        (rest.recording, rest.time_s)
-        for stage in (accelerometer.stages if accelerometer else ())
-        for rest in stage.details.rests_left_out or ()
-    }
+    left_out = [stage.details.rests_left_out or () for stage in (accelerometer.stages if accelerometer else ())]
+    refused = {(rest.recording, rest.time_s) for rests in left_out for rest in rests}
     chosen: dict[int, list[Rest]] = {}
     held: set[tuple[int, int]] = set()
     for index, recording in enumerate(recordings):
@@ -317,15 +314,8 @@ def gathered(sensor: str, recordings: Sequence[Recording], chosen: Mapping[int, 
     shared = len(np.unique(columns["recording"])) == 1 or all(recordings[index].clock_shared for index in chosen)
     used = [recordings[index] for index in chosen]
     swings = heats_and_cools(temperature_of(r) for r in used if r.temperature is not None and r.kind != ATTITUDES)
-    repeats = passed_again(columns["temperature"][columns["soaked"]])
-    return Rests(
-        **columns,
-        clock_shared=shared,
-        kinds=frozenset(r.kind for r in used),
-        swings=swings,
-        repeats=repeats,
-        scatter_time=0.0,
-    )
+    kinds, repeats = frozenset(r.kind for r in used), passed_again(columns["temperature"][columns["soaked"]])
+    return Rests(**columns, clock_shared=shared, kinds=kinds, swings=swings, repeats=repeats, scatter_time=0.0)
 
 
 def passed_again(temperature: Values) -> bool:

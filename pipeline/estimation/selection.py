@@ -85,9 +85,8 @@ def select(
         start, limits = ordinary_base(observations, noise), limits_of(observations.sensor, data_sheet)
         base = fit_best(observations, starts, start, grid)
         ranking = Ranking(observations, base, base, candidates, grid)
-        selection = Selection(
-            observations, noise, data_sheet, start, grid, limits, candidates, base, base, ranking, ranking, near=near
-        )
+        known = observations, noise, data_sheet, start, grid, limits, candidates
+        selection = Selection(*known, base, base, ranking, ranking, near=near)
         if search:
             selection.run()
         return selection

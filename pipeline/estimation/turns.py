@@ -260,13 +260,8 @@ class RowGroups:
         """Return the motion at the rows."""
         resting, known = motion.still[self.kept[self.first]], self.all(motion.reference_valid)
         found = motion.mapped(self.means, still=resting, reference_valid=known)
-        logged = motion.at_offset
-        if (
-            motion.axis is not None
-            and logged
-            and self.count.max(initial=0.0) > ALL_SAMPLES
-            and _step(motion) <= FINEST_STEP_S
-        ):
+        logged, long = motion.at_offset, self.count.max(initial=0.0) > ALL_SAMPLES
+        if motion.axis is not None and logged and long and _step(motion) <= FINEST_STEP_S:
             still = cache(lambda: logged(rows=self._pieces))  # the same integrals of the motion that is not shifted
             return self._with_trajectory(found, motion, partial(self._mean_at, found, still))
         return self._with_trajectory(found, motion, self._at)

@@ -337,9 +337,8 @@ def combined(
     covariance, freedom = np.zeros((len(parameters),) * 2), np.full(len(parameters), np.inf)
     if lines:
         covariance = np.sum([c.covariance for c in lines], axis=0)
-        freedom = effective_degrees_of_freedom(
-            np.array([c.standard_uncertainty for c in lines]), np.array([c.degrees_of_freedom for c in lines])
-        )
+        u = np.array([c.standard_uncertainty for c in lines])
+        freedom = effective_degrees_of_freedom(u, np.array([c.degrees_of_freedom for c in lines]))
     reasons, sources = {**missing, "repeatability": f"{NOT_STATED}, and compare"}, {c.source for c in lines}
     left_out = tuple(NotIncluded(source, reason) for source, reason in reasons.items() if source not in sources)
     return with_uncertainty(calibration, covariance, freedom, Budget(tuple(c.line() for c in lines), left_out))

@@ -168,11 +168,8 @@ def turns_of(parts: Sequence[TurnPart], *, as_printed: bool) -> list[AxisTurns]:
     """Return the turns about x, y and z; raise ``NotObservableError`` if there is none about one of the axes."""
     turns = []
     for axis in range(3):
-        used = [
-            replace(part, keep=part.keep if as_printed else filtered_alike(part))
-            for part in parts
-            if part.motion.axis == axis
-        ]
+        used = [part for part in parts if part.motion.axis == axis]
+        used = used if as_printed else [replace(part, keep=filtered_alike(part)) for part in used]
         if not any(np.any(part.keep) for part in used):
             raise NotObservableError(
                 f"no usable sample of a turn about body axis {AXES[axis]}: the staged method needs a turn about each "
@@ -289,11 +286,10 @@ def _per_axis(name: str, values: Values, unit: str) -> NamedValues:
 
 
 def _angles(sides: Mapping[str, Values]) -> NamedValues:
-    return {
-        f"{name}_{side}": (float(angle), "deg")
-        for side, degrees in sides.items()
-        for name, angle in zip(GREEK, degrees, strict=True)
-    }
+    named = [
+        (f"{name}_{side}", angle) for side, angles in sides.items() for name, angle in zip(GREEK, angles, strict=True)
+    ]
+    return {name: (float(angle), "deg") for name, angle in named}
 
 
 def orthogonality(extremes: Extremes) -> EstimatedSteps:
@@ -560,9 +556,7 @@ def _resampled(
     cuts = np.cumsum([len(turn.angle) for turn in turns])[:-1]
     vectors = []
     for noisy in noise.draws(np.random.default_rng(SEED), REPLICATES):
-        synthetic = [
-            replace(turn, reading=mean + new)
-            for turn, mean, new in zip(turns, means, np.split(noisy, cuts), strict=True)
-        ]
+        drawn = zip(turns, means, np.split(noisy, cuts), strict=True)
+        synthetic = [replace(turn, reading=mean + new) for turn, mean, new in drawn]
         vectors.append(follow(extremes_of_samples(synthetic, gravity_g), names).vector())
     return scatter_contribution(np.cov(np.array(vectors).T), REPLICATES - 1.0)

@@ -149,9 +149,8 @@ def fit(task: StageInput) -> SensorCalibration:
     matrix = calibration_matrix(A, as_printed=as_printed)
     # The rms error of the integrated angles: rows are turn axes, columns are sensor axes.
     squares, about = (Y @ matrix.T - U) ** 2, np.argmax(np.abs(U), axis=1)
-    angle_errors = [
-        np.sqrt(squares[about == i].mean(axis=0)).tolist() if np.any(about == i) else 3 * [None] for i in range(3)
-    ]
+    of_axes = [squares[about == i] for i in range(3)]
+    angle_errors = [np.sqrt(each.mean(axis=0)).tolist() if len(each) else 3 * [None] for each in of_axes]
     after = (turns.reading - previous.bias) @ matrix.T
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(turns.rate, axis=1)
     details = StageDetails(

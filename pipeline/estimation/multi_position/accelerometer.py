@@ -76,16 +76,12 @@ def parted(rests: Rests) -> tuple[Rests, Rests | None]:
     own = (np.arange(len(first))[:, None] == of).astype(float)
     mean = own / own.sum(axis=1, keepdims=True)
     found = rests.select(kept)
-    for weights, names in (
-        (mean, ("reading", "time", "temperature", "temperature_rate")),
-        (mean**2, ("share", "own")),
-        (own, ("count", "scatter", "length")),
-    ):
-        columns = {name: getattr(found, name).copy() for name in names}
-        for name, column in columns.items():
-            column[found.soaked] = weights @ getattr(parts, name)
-        found = replace(found, **columns)
-    return found, parts
+    weights = dict.fromkeys(("reading", "time", "temperature", "temperature_rate"), mean)
+    weights |= dict.fromkeys(("share", "own"), mean**2) | dict.fromkeys(("count", "scatter", "length"), own)
+    columns = {name: getattr(found, name).copy() for name in weights}
+    for name, column in columns.items():
+        column[found.soaked] = weights[name] @ getattr(parts, name)
+    return replace(found, **columns), parts
 
 
 def contrasts(parts: Rests) -> Values:
@@ -149,12 +145,10 @@ class AccelerometerModel:
         base = np.concatenate([-along, (n[:, :, None] * v[:, None, :]).reshape(-1, 9)], axis=1)
 
         def effect_columns(term: EffectColumns) -> Values:
-            return self._at_rests(
-                rests,
-                self.gravity * n,
-                lambda motion: term.effect.columns(self.sensor, motion, state.K, term.values),
-                after,
-            )
+            def columns(motion: Motion) -> Values:
+                return term.effect.columns(self.sensor, motion, state.K, term.values)
+
+            return self._at_rests(rests, self.gravity * n, columns, after)
 
         of_rests = EquationBlock(
             (target - length) / error,
@@ -232,12 +226,13 @@ class AccelerometerModel:
         """Return the specific force of each rest, g, and v: (m, 3) arrays."""
         v, K = rests.reading - state.bias, state.K
         force = v @ state.matrix.T
+
+        def added(motion: Motion) -> Values:
+            return effect_readings(self.sensor, state.terms, motion, K)
+
         for _ in range(FORCE_ITERATIONS if state.terms else 0):
             size = np.linalg.norm(force, axis=1, keepdims=True)
-            z = self._at_rests(
-                rests, self.gravity * force / size, lambda motion: effect_readings(self.sensor, state.terms, motion, K)
-            )
-            v = rests.reading - state.bias - z
+            v = rests.reading - state.bias - self._at_rests(rests, self.gravity * force / size, added)
             before, force = force, v @ state.matrix.T
             if np.abs(force - before).max() < SETTLED_FORCE_G:
                 break

@@ -347,10 +347,8 @@ class TurnsByHand:
         """
         count = len(self.name)
         angle = "angle_accuracy_deg" if self.by_length else "procedure.turns.accuracy_deg"
-        turned = [
-            (f"the turn at {self.time[t, 0]:.1f} s of {self.name[t]} is", abs(residual[t]), deviation[t], angle)
-            for t in range(count)
-        ]
+        turns = [f"the turn at {self.time[t, 0]:.1f} s of {name} is" for t, name in enumerate(self.name)]
+        turned = [(what, abs(residual[t]), deviation[t], angle) for t, what in enumerate(turns)]
         across = np.linalg.norm(residual[count:].reshape(-1, 2), axis=1)
         first = [name_of_axis(self.direction[self.group == group][0]) for group in np.unique(self.group)]
         turned += [

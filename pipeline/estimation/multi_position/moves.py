@@ -120,11 +120,8 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
 
     Moves with clipped, stuck or missing readings, with a gap, or longer than a minute are not used.
     """
-    found = [
-        (i, j, span)
-        for i, j, span in spans_between(rests)
-        if not rests.held_out[j] and sound_span(recordings[rests.recording[j]], span)
-    ]
+    found = [(i, j, span) for i, j, span in spans_between(rests) if not rests.held_out[j]]
+    found = [(i, j, span) for i, j, span in found if sound_span(recordings[rests.recording[j]], span)]
     if not found:
         return None
     before, after = np.array([[i, j] for i, j, _ in found]).T
@@ -141,10 +138,8 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
     weight = trapezoids(time)
     excess, doubt = _bends(reading, weight, BENT_RATE_RATIO * float(np.linalg.norm(rests.white)))
     share = (time - rests.time[before][:, None]) / (rests.time[after] - rests.time[before])[:, None]
-    warmth, warming = (
-        values[before][:, None] + share * (values[after] - values[before])[:, None]
-        for values in (rests.temperature, rests.temperature_rate)
-    )
+    pairs = [(v[before][:, None], v[after][:, None]) for v in (rests.temperature, rests.temperature_rate)]
+    warmth, warming = (first + share * (last - first) for first, last in pairs)
     return Moves(before, after, reading - excess, time, warmth, warming, weight, doubt)
 
 
@@ -230,24 +225,16 @@ def clocks_of(time: Values, rate: Values, moves: Sequence[slice], white: Values)
         regular = gain > (-CLEAR_CLOCK_GAIN if rounded else CLEAR_CLOCK_GAIN)
         return [(whole if regular else time)[span] for span in moves]
     pairs = [(span, _regular_stamps(time[span])) for span in moves]
-    gain = sum(
-        _roughness(time[span], rate[span], white) - _roughness(line, rate[span], white)
-        for span, line in pairs
-        if line is not None
-    )
+    both = [(time[span], line, rate[span]) for span, line in pairs if line is not None]
+    gain = sum(_roughness(stamps, own, white) - _roughness(line, own, white) for stamps, line, own in both)
     return [time[span] if line is None or gain <= CLEAR_CLOCK_GAIN else line for span, line in pairs]
 
 
 def sound_span(recording: Recording, span: slice, longest: float = MAX_MOVE_S) -> bool:
     """Return whether the gyroscope's samples can be integrated: all valid, without a gap, for less than ``longest``."""
-    time = recording.time[span]
+    time, gap = recording.time[span], MAX_INTERPOLATED_INTERVALS * recording.interval
     whole = bool(np.all(sound_samples(recording, "gyroscope")[span]))
-    return (
-        whole
-        and len(time) > 2
-        and time[-1] - time[0] < longest
-        and np.diff(time).max() < MAX_INTERPOLATED_INTERVALS * recording.interval
-    )
+    return whole and len(time) > 2 and time[-1] - time[0] < longest and np.diff(time).max() < gap
 
 
 def to_the_end(rate: Values, time: Values) -> Values:
@@ -335,9 +322,8 @@ def gravity_of(
     """Return gravity at the rests of the accelerometer, in a soak the mean; ``moved``: see ``observed_rests``."""
     root = root_of(accelerometer.parameters.covariance[BASE, BASE])
     moved = np.zeros(BASE_COUNT) if moved is None else moved
-    accelerometer = replace(
-        accelerometer, bias=accelerometer.bias + moved[BIAS], matrix=accelerometer.matrix + matrix_of(moved)
-    )
+    bias, matrix = accelerometer.bias + moved[BIAS], accelerometer.matrix + matrix_of(moved)
+    accelerometer = replace(accelerometer, bias=bias, matrix=matrix)
     effects = [e for e in accelerometer.effects if not effect(e.name).moves]
 
     def force_of(reading: Values) -> Values:

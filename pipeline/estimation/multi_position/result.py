@@ -200,10 +200,8 @@ def _with_monte_carlo(
     prior = np.diag(np.sqrt(fitted.precision))[fitted.precision > 0.0]
     X, H = np.concatenate([equations.columns, prior]), np.zeros((n + len(prior), p, p))
     H[:n] = curvature(model, fitted)
-    covariances = [
-        scipy.linalg.block_diag(equations.scaled(noise, scale), np.eye(len(prior)))
-        for noise, _, scale in fitted.hypotheses
-    ]
+    of_equations = [equations.scaled(noise, scale) for noise, _, scale in fitted.hypotheses]
+    covariances = [scipy.linalg.block_diag(C, np.eye(len(prior))) for C in of_equations]
     solvers = [quadratic_results(X, H, np.asarray(np.linalg.pinv(c, hermitian=True), float)) for c in covariances]
     weight, place = np.array([w for _, w, _ in fitted.hypotheses]), _places(model, fitted)
     effects = [value for term in fitted.state.terms for value in term.values]
