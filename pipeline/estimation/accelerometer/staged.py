@@ -273,14 +273,6 @@ def by_turn(sinusoids: Sequence[Sequence[Sinusoid]], values: Values) -> list[lis
     return [pieces[turn :: len(sinusoids)] for turn in range(len(sinusoids))]
 
 
-def convergence_of_sinusoids(sinusoids: Sequence[Sequence[Sinusoid]]) -> Convergence:
-    """Return the evidence of the sinusoids' fits: the largest cosine and condition of all."""
-    fits = [s for turn in sinusoids for s in turn]
-    parts = [linear_convergence(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in fits]
-    count = sum(part.parameters for part in parts)
-    return Convergence(max(part.cosine for part in parts), max(part.condition for part in parts), count, count)
-
-
 def _per_axis(name: str, values: Values, unit: str) -> NamedValues:
     return {f"{name}_{axis}": (float(value), unit) for axis, value in zip(AXES, values, strict=True)}
 
@@ -512,6 +504,9 @@ def fit(task: StageInput) -> SensorCalibration:
     rms = float(np.sqrt(np.mean((np.linalg.norm(after, axis=1) - gravity_g) ** 2)))
     details = details_on_table(noise, scatter.degrees_of_freedom, parts, len(after))
     result = StageResult(name, parameters, rms, tuple(found.steps), details)
+    of_turns = [s for turn in sinusoids for s in turn]
+    fits = [linear_convergence(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in of_turns]
+    cosine, condition = max(each.cosine for each in fits), max(each.condition for each in fits)
     last, named = name == "scale_factor", effect(ASYMMETRY).parameters("accelerometer")
     asymmetry = {p.name: Coefficient(float(v), p.unit) for p, v in zip(named, found.c, strict=True)}
     calibration = SensorCalibration(
@@ -520,7 +515,7 @@ def fit(task: StageInput) -> SensorCalibration:
         matrix=np.diag(1.0 / found.k),
         stages=(*task.stages, result),
         effects=(FittedEffect(ASYMMETRY, asymmetry),) if last else (),
-        convergence=convergence_of_sinusoids(sinusoids),
+        convergence=Convergence(cosine, condition, len(theta), len(theta)),
     )
     kept = slice(0, after_c) if last else BASE
     if estimator.as_printed:

@@ -311,6 +311,8 @@ class TurnsByHand:
             return np.asarray(-WM.reshape(len(error), -1) @ integrals.reshape(WM[0].size, -1) / error[:, None])
 
         residual = (self.value - np.einsum("rtc,tc->r", WM, total)) / error
+        about = (self.stated[:, None] * self.direction) @ skew(np.eye(3)).transpose(0, 2, 1)  # (3, t, 3)
+        by_frame = -self.frame * np.einsum("rti,kti->rk", self.rows, about)  # by each angle of the frame off the case
         return EquationBlock(
             residual,
             np.concatenate([bias, matrix], axis=1) / error[:, None],
@@ -318,13 +320,8 @@ class TurnsByHand:
             error,
             np.einsum("rtc,t,c->crt", -WM, length, white) / error[:, None],
             (self.time[:, 0], self.time[:, -1] - self.time[:, 0], self.recording),
-            frame=self._by_frame() / error[:, None] if self.frame else None,
+            frame=by_frame / error[:, None] if self.frame else None,
         )
-
-    def _by_frame(self) -> Values:
-        """Return the change of the residuals by each angle of the frame off the case: (r, 3) array, deg."""
-        turned = (self.stated[:, None] * self.direction) @ skew(np.eye(3)).transpose(0, 2, 1)  # (3, t, 3)
-        return np.asarray(-self.frame * np.einsum("rti,kti->rk", self.rows, turned))
 
     def described(self, state: State) -> list[TurnAngle]:
         """Return recording, start in s, axis, stated and calibrated total angle in deg of each turn."""

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import scipy
 
-from pipeline.core.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX, MATRIX_NAMES
+from pipeline.core.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX
 from pipeline.estimation.engine import cholesky, draw_normal
 from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
@@ -113,16 +113,11 @@ class GyroscopeModel:
             blocks.append(self.turns.equations(state, self.white))
         if self.known_by_limit:
             columns = np.eye(BASE_COUNT)[[BASE_NAMES.index(name) for name in self.known_by_limit]]
-            blocks.append(replace(limit_block(self.known_by_limit, columns, state), frame=self._of_limits_by_frame()))
+            by_frame = -self.frame * (skew(np.eye(3)).reshape(3, 9) @ columns[:, MATRIX].T).T  # by each of its angles
+            limits = np.array(list(self.known_by_limit.values()))[:, None]
+            of_limits = limit_block(self.known_by_limit, columns, state)
+            blocks.append(replace(of_limits, frame=by_frame / limits if self.frame else None))
         return stacked(blocks, self, state, candidates)
-
-    def _of_limits_by_frame(self) -> Values | None:
-        """Return the change of the pseudo-observations by each angle of the frame off the case: (k, 3) array."""
-        if not self.frame:
-            return None
-        u = np.array(list(self.known_by_limit.values()))
-        change = skew(np.eye(3)).reshape(3, 9)[:, [MATRIX_NAMES.index(name) for name in self.known_by_limit]]
-        return np.asarray(-self.frame * change.T / u[:, None])
 
     @property
     def temperature(self) -> Values:

@@ -296,10 +296,13 @@ def observed_rests(
     """
     of_force = rests_of("accelerometer", recordings, procedure, accelerometer, role)
     of_rate = rests_of("gyroscope", recordings, procedure, accelerometer, role)
-    if accelerometer is None:
-        return None if of_rate is None else (of_rate, _no_gravity(len(of_rate.time)))
-    if of_force is None or of_rate is None:
+    if of_rate is None or (accelerometer is not None and of_force is None):
         return None
+    if accelerometer is None or of_force is None:
+        count, errors = len(of_rate.time), np.zeros((BASE_COUNT, BASE_COUNT))
+        zeros, none, shared = np.zeros((count, 3)), np.zeros(count), np.zeros((count, 3, BASE_COUNT))
+        steady, moved = np.zeros(count, bool), np.zeros(BASE_COUNT)
+        return of_rate, GravityAtRests(zeros, zeros, zeros, none, none, errors, shared, steady, moved)
     pair = of_force, of_rate
     keys = [list(zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)) for r in pair]
     both = set(keys[0]) & set(keys[1])
@@ -307,13 +310,6 @@ def observed_rests(
     if len(of_rate.time) == 0:
         return None
     return of_rate, gravity_of(recordings, of_force, accelerometer, moved)
-
-
-def _no_gravity(count: int) -> GravityAtRests:
-    zeros, none = np.zeros((count, 3)), np.zeros(count)
-    errors = np.zeros((BASE_COUNT, BASE_COUNT))
-    shared = np.zeros((count, 3, BASE_COUNT))
-    return GravityAtRests(zeros, zeros, zeros, none, none, errors, shared, np.zeros(count, bool), np.zeros(BASE_COUNT))
 
 
 def gravity_of(

@@ -127,9 +127,12 @@ class SelectionByHand:
         self.base = fit_configured(model, start, configured, self.hypotheses, self.bounds, small)
         self.ceilings = self.base.equations.ceilings(self.hypotheses)
         self._search()
-        if LAG in self.names and self._is_hysteresis():
-            self.candidates = [e for e in self.candidates if e.name != LAG]
-            self._search()
+        if LAG in self.names:
+            state = self._state([name for name in self.names if name != LAG])
+            loops = loops_of(model, state.terms)
+            if loops and is_hysteresis(judged_curves(model.equations(state, loops), self.hypotheses)):
+                self.candidates = [e for e in self.candidates if e.name != LAG]
+                self._search()
         parts = [self._fitted(self.names[:count]) for count in range(1, len(self.names))]
         self.fits = [self.base, *parts, self.fit] if self.names else [self.base]
 
@@ -153,12 +156,6 @@ class SelectionByHand:
             elif not self._exchange():
                 break
             self.last = self._scored(self.names)
-
-    def _is_hysteresis(self) -> bool:
-        """Return whether thermal hysteresis explains the soaks better than the lag that is selected."""
-        state = self._state([name for name in self.names if name != LAG])
-        loops = loops_of(self.model, state.terms)
-        return bool(loops) and is_hysteresis(judged_curves(self.model.equations(state, loops), self.hypotheses))
 
     def _scored(self, names: Sequence[str]) -> CandidateScores:
         """Score every effect given base, configured and some of the selected effects."""
