@@ -65,10 +65,6 @@ class LinearMap:
         """Number of parameters."""
         return int(self.derivative[0].shape[0])
 
-    def then(self, change: Values) -> LinearMap:
-        """Return the map to ``change @ parameters``; ``change``: (r, p)."""
-        return LinearMap(self.weights, tuple(change @ J for J in self.derivative))
-
     def first(self) -> LinearMap:
         """Return the map to the fitted values of all channels, one after the other."""
         sizes = [len(A) for A in self.weights]

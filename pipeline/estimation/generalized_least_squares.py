@@ -256,7 +256,7 @@ def _residual_noise(
     design: Design, observations: Observations, settings: Sequence[Setting], reference: Reference
 ) -> ResidualNoise:
     """Weight the hypotheses about the noise by their restricted likelihood, for a design at its solution."""
-    weight, blocks, white = observations.weight, observations.long_blocks, design.scale
+    weight, blocks, white = observations.weight, observations.in_blocks(np.inf), design.scale  # few: dense covariances
     disturbed = disturbance(reference, observations.reading, blocks, weight, white)
     if disturbed is not None:
         columns = np.zeros((3, len(blocks.weight), design.count + 1))
@@ -406,7 +406,7 @@ def calibration_of(
     design = fit.design(observations)
     first = design.linear_map(fit.setting)
     prior = wander_prior(noise, settings.sensor.of(sensor))
-    whole = first.then(change)
+    whole = replace(first, derivative=tuple(change @ J for J in first.derivative))
     reference = Reference(sensor, [part.motion for part in observations.parts], fit.K, settings.table)
     errors = _residual_noise(design, observations, prior.grid(float(np.sqrt(np.mean(design.scale**2)))), reference)
     values = np.concatenate([base_values(fit.bias, fit.K), *(term.values for term in fit.terms)])

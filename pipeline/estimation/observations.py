@@ -136,14 +136,10 @@ class Observations:
     @cached_property
     def blocks(self) -> Blocks:
         """Short stretches of time in which the bias is assumed constant."""
-        return self._blocks(self.steady)
+        return self.in_blocks(self.steady)
 
-    @cached_property
-    def long_blocks(self) -> Blocks:
-        """Longer stretches, so few that the covariance of their bias can be dense."""
-        return self._blocks(float("inf"))
-
-    def _blocks(self, longest: float) -> Blocks:
+    def in_blocks(self, longest: float) -> Blocks:
+        """Return stretches in which the bias is assumed constant: of ``longest``, s, at most, unless they are too many."""
         span = sum(float(np.ptp(part.motion.time)) for part in self.parts)
         length = min(longest, max(SHORTEST_BLOCK_S, span / BIAS_BLOCKS))
         apart = [not _follows(before, part) for before, part in pairwise(self.parts)]

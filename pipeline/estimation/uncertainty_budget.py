@@ -236,7 +236,8 @@ def changes_through_gravity(
         return {}
     rests, force, M = model.every, model.at_rests.force, accelerometer.matrix
     motion = centred([motion_at_rests(rests, force)])[0]
-    by_force = np.einsum("pn,nmc->pmc", gain[:, model.of_moves], model.by_force(fitted.state))
+    of_moves = np.asarray(model.equations_of_moves(fitted.state).force)
+    by_force = np.einsum("pn,nmc->pmc", gain[:, model.of_moves], of_moves)
     K = np.asarray(np.linalg.solve(M, np.eye(3)), np.float64)
     found: dict[str, Values] = {}
     for this, start, limits in limited_effects("accelerometer", (), data_sheet):

@@ -325,7 +325,10 @@ class TurnsByHand:
 
     def described(self, state: State) -> list[TurnAngle]:
         """Return recording, start in s, axis, stated and calibrated total angle in deg of each turn."""
-        angles = self._angles(state)
+        Phi = np.einsum("ts,tsi->ti", self.weight, self._samples(state)[1]) @ state.matrix.T
+        angles = np.sum(Phi * self.direction, axis=1)
+        if self.by_length:
+            angles = np.sign(self.stated) * np.linalg.norm(Phi, axis=1)
         return [
             TurnAngle(
                 recording=self.name[t],
@@ -357,13 +360,6 @@ class TurnsByHand:
             for what, off, error, name in turned
             if off > DEPARTS * error
         ]
-
-    def _angles(self, state: State) -> Values:
-        """Return the total angle of each turn, as it is stated: (t,) array, deg."""
-        Phi = np.einsum("ts,tsi->ti", self.weight, self._samples(state)[1]) @ state.matrix.T
-        if self.by_length:
-            return np.asarray(np.sign(self.stated) * np.linalg.norm(Phi, axis=1))
-        return np.asarray(np.sum(Phi * self.direction, axis=1))
 
     def _samples(self, state: State) -> tuple[Motion, Values]:
         """Return the motion of all samples, and ``v = y - b - z``."""

@@ -31,7 +31,6 @@ import numpy as np
 import scipy
 
 from pipeline.core.records import BASE, BASE_COUNT, BASE_NAMES, BIAS, MATRIX
-from pipeline.estimation.engine import cholesky, draw_normal
 from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
 from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, turns_of
@@ -67,8 +66,6 @@ if TYPE_CHECKING:
 MIN_MOVES = 6  # two equations each, for the nine of the matrix
 RATE_ITERATIONS = 6  # of effects that depend on the rate
 SETTLED_DPS = 1e-6  # change of the rate that ends these rounds: 1e-5 deg in 10 s, 2e-3 of the noise of a move
-NORMAL_DEGREES_OF_FREEDOM = 1e6  # degrees of freedom beyond which Student's t is normal to 1e-6
-INTERVAL_DRAWS, INTERVAL_TAIL = 4000, 0.005  # as in the 99 % interval of other held-out errors: 20 draws are beyond it
 
 
 @dataclass(eq=False)
@@ -108,7 +105,7 @@ class GyroscopeModel:
         """Return the linearised equations at given parameters."""
         blocks = [self._at_rest(state)]
         if self.moves is not None:
-            blocks.append(self._of_moves(state))
+            blocks.append(self.equations_of_moves(state))
         if self.turns is not None:
             blocks.append(self.turns.equations(state, self.white))
         if self.known_by_limit:
@@ -157,56 +154,8 @@ class GyroscopeModel:
         predicted = np.einsum("kij,kj->ki", A[:, 0], self.before)
         across = np.linalg.norm(np.cross(predicted, self.after), axis=1)
         error = np.degrees(np.arctan2(across, np.einsum("ki,ki->k", predicted, self.after)))
-        noise = self._of_moves(state).error.reshape(-1, 2)
+        noise = self.equations_of_moves(state).error.reshape(-1, 2)
         return error, np.sqrt(0.25 * np.pi * np.sum(noise**2, axis=1))
-
-    def largest_direction_error(
-        self, state: State, covariance: Values, freedom: Values, scatter: tuple[float, float], ratio: float
-    ) -> float:
-        """Return the bound that the rms of ``direction_errors`` exceeds with a probability of 0.5 %, deg; simulated.
-
-        ``covariance``: (p, p), of bias and matrix first. ``freedom``: (p,), degrees of freedom. ``scatter``: of moves
-        and of directions, over the noise. ``ratio``: of bias wander to white noise.
-        """
-        block = self._of_moves(state)
-        drawn, _ = self._drawn_errors(block, covariance, freedom, scatter, ratio)
-        rms = np.sqrt(2.0 * np.mean((drawn * block.error) ** 2, axis=1))
-        return float(np.quantile(rms, 1.0 - INTERVAL_TAIL))
-
-    def weighted_direction_error(
-        self, state: State, covariance: Values, freedom: Values, scatter: tuple[float, float], ratio: float
-    ) -> float:
-        """Return ``sqrt(e^T S^-1 e)`` of the errors e of all moves, over what it exceeds with a probability of 0.5 %.
-
-        S is their covariance. Where a large error of one direction is likely, as by an axis that few rests determine,
-        it does not hide one of another direction. Parameters as of ``largest_direction_error``.
-        """
-        block = self._of_moves(state)
-        drawn, S = self._drawn_errors(block, covariance, freedom, scatter, ratio)
-        L = cholesky(S + block.base @ covariance[BASE, BASE] @ block.base.T)
-        sizes = [np.linalg.norm(np.linalg.solve(L, e), axis=0) for e in (block.residual, drawn.T)]
-        return float(sizes[0] / np.quantile(sizes[1], 1.0 - INTERVAL_TAIL))
-
-    @staticmethod
-    def _drawn_errors(
-        block: EquationBlock, covariance: Values, freedom: Values, scatter: tuple[float, float], ratio: float
-    ) -> tuple[Values, Values]:
-        """Return errors of moves over their white noise, (draws, n), and their covariance without the calibration's.
-
-        Errors of the accelerometer's calibration are drawn both for the directions and in the covariance, as if these
-        were independent; so bounds are too large rather than too small.
-        """
-        n, H = len(block.residual), np.asarray(block.bias)
-        S = (1.0 + scatter[0] ** 2) * np.eye(n) + np.asarray(block.common)
-        S = S + scatter[1] ** 2 * np.asarray(block.direction)
-        S = S + ratio**2 * np.einsum("cnk,cmk->nm", H, H)
-        rng = np.random.default_rng(0)
-        drawn = rng.standard_normal((INTERVAL_DRAWS, n)) @ cholesky(S).T  # continuous in S, as eigenvectors are not
-        errors = draw_normal(rng, covariance[BASE, BASE], INTERVAL_DRAWS)
-        for part in (BIAS, MATRIX):  # the wander reduces the degrees of freedom of the bias
-            least = min(float(freedom[part].min()), NORMAL_DEGREES_OF_FREEDOM)
-            errors[:, part] *= np.sqrt(least / rng.chisquare(least, (INTERVAL_DRAWS, 1)))
-        return drawn + errors @ block.base.T, S
 
     def _rate_at_rest(self, rests: Rests, force: Values, state: State) -> tuple[Values, Motion]:
         """Return the readings at rests minus those that the model predicts, (m, 3), and the motion."""
@@ -253,7 +202,8 @@ class GyroscopeModel:
         creep = scipy.linalg.block_diag(*(K @ rate @ K.T / error[:, :, None] / error[:, None, :]))
         return np.asarray(creep + rounding)
 
-    def _of_moves(self, state: State) -> EquationBlock:
+    def equations_of_moves(self, state: State) -> EquationBlock:
+        """Return the equations of the moves."""
         moves, gravity = self.moves, self.at_rests
         assert moves is not None  # noqa: S101
         k, n = np.arange(moves.count), 2 * moves.count
@@ -308,15 +258,11 @@ class GyroscopeModel:
             force=WD,
         )
 
-    def by_force(self, state: State) -> Values:
-        """Return the change of the moves' residuals by the specific force at each rest, per g: (n, m, 3) array."""
-        return np.asarray(self._of_moves(state).force)
-
     def accelerometer_errors(self, fitted: FitByHand) -> Values:
         """Return the estimate of the accelerometer's errors of bias and matrix from the moves: (12,) array."""
         equations = fitted.equations
         shared = np.zeros((len(equations.residual), BASE_COUNT))
-        shared[self.of_moves] = self._of_moves(fitted.state).shared
+        shared[self.of_moves] = self.equations_of_moves(fitted.state).shared
         white, _ = equations.whitened(fitted.noise, np.column_stack([shared, equations.residual]))
         return np.asarray(-self.at_rests.root @ (white[:, :-1].T @ white[:, -1]))
 

@@ -146,7 +146,7 @@ def test_a_rotation_of_the_case_changes_both_frames_and_no_move(whole: Session) 
     noise = noise_of("gyroscope", whole.recordings, whole.settings.sensor.gyroscope)
     model = model_of(whole.recordings, gyroscope, noise, whole.settings.procedure, whole.fit("accelerometer"))
     assert model is not None
-    moves = model._of_moves(State(gyroscope.bias, gyroscope.matrix))
+    moves = model.equations_of_moves(State(gyroscope.bias, gyroscope.matrix))
     for x in range(3):
         R = np.zeros((3, 3))
         R[(x + 1) % 3, (x + 2) % 3], R[(x + 2) % 3, (x + 1) % 3] = -1.0, 1.0
