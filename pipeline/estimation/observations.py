@@ -139,7 +139,7 @@ class Observations:
         return self.in_blocks(self.steady)
 
     def in_blocks(self, longest: float) -> Blocks:
-        """Return stretches in which the bias is assumed constant: of ``longest``, s, at most, unless they are too many."""
+        """Return stretches in which the bias is assumed constant, of at most ``longest``, s, unless too many."""
         span = sum(float(np.ptp(part.motion.time)) for part in self.parts)
         length = min(longest, max(SHORTEST_BLOCK_S, span / BIAS_BLOCKS))
         apart = [not _follows(before, part) for before, part in pairwise(self.parts)]

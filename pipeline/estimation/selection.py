@@ -72,24 +72,20 @@ def select(
             zeros = np.zeros(len(this.parameters(observations.sensor)))
             prior = prior_of(this, observations, accelerometer, configured)
             candidates[this.name] = EffectColumns(this, zeros, prior=prior)
+
+        def selected() -> Selection:
+            start, limits = ordinary_base(observations, noise), limits_of(observations.sensor, data_sheet)
+            base = fit_best(observations, starts, start, grid)
+            ranking = Ranking(observations, base, base, candidates, grid)
+            given = observations, noise, data_sheet, start, grid, limits, candidates
+            selection = Selection(*given, base, base, ranking, ranking, near=near)
+            if search:
+                selection.run()
+            return selection
+
         models = [[*candidates.values()], *starts]
         key = select, tuple(tuple(term.key for term in terms) for terms in models), data_sheet.model_dump_json(), search
-        return observations.once(key, lambda: selected(observations, starts, candidates, near))
-
-    def selected(
-        observations: Observations,
-        starts: list[list[EffectColumns]],
-        candidates: dict[str, EffectColumns],
-        near: Mapping[tuple[str, ...], JointFit],
-    ) -> Selection:
-        start, limits = ordinary_base(observations, noise), limits_of(observations.sensor, data_sheet)
-        base = fit_best(observations, starts, start, grid)
-        ranking = Ranking(observations, base, base, candidates, grid)
-        known = observations, noise, data_sheet, start, grid, limits, candidates
-        selection = Selection(*known, base, base, ranking, ranking, near=near)
-        if search:
-            selection.run()
-        return selection
+        return observations.once(key, selected)
 
     selection = searched(observations, {})
     remaining = without_unknown_motion(observations, selection.fit.terms)

@@ -399,17 +399,17 @@ def _fit_to_corrected(
     held = [s for s in previous.stages if s.name in stages and stages[s.name].known]
     before = without_known(previous, known)
     before = replace(before, stages=tuple(s for s in previous.stages if s not in held))
-    at, passes = before, 0
-    while True:
+    at = before
+    for _ in range(MOST_PASSES):
         filtered = replace(recordings, filtered=subtracted(recordings.filtered, at, known, (sensor, "rests")))
         found = _fitted(fit, replace(task, recordings=filtered, previous=before if before.stages else None))
         if found is before:  # nothing to fit
             return previous
-        passes += 1
         change = max(np.abs(found.bias - at.bias).max(), np.abs(found.matrix - at.matrix).max())
-        if change <= SETTLED or passes == MOST_PASSES:
-            return with_known(found, known, held)
         at = found
+        if change <= SETTLED:
+            break
+    return with_known(at, known, held)
 
 
 def is_given(sensor: str, method: Method) -> bool:
