@@ -38,8 +38,12 @@ SOFT_STEP_WIDTHS = (0.5, 1.0, 2.0)  # of a soft step in a finer scan, over that 
 SAME_SPEED = 0.02  # relative difference of values that are one speed of the procedure
 SIGNAL_UNITS = {"temperature": "degC", "time": "s", "speed": "deg/s", "angle": "deg"} | {f"f{a}": "g" for a in "xyz"}
 ORIGIN = "(temperature - 25)"  # data sheets and the catalogue also state powers of the temperature above 25 degC
-SIGNAL_WORDS = {"u": "the axis' own signal", "speed": "the speed", "time": "the time"}
-SIGNAL_WORDS[ORIGIN] = "the temperature above 25 degC"
+SIGNAL_WORDS = {
+    "u": "the axis' own signal",
+    "speed": "the speed",
+    "time": "the time",
+    ORIGIN: "the temperature above 25 degC",
+}
 Curves: TypeAlias = "Callable[[Motion], Values]"  # to (n, 1, q), or (n, 3, q) if they differ between the axes
 
 
