@@ -414,12 +414,6 @@ class ScaledColumns:
         """Return the pseudo-inverse for full rank, ``solve(y) = weights @ y``: (p, n) array."""
         return (self.Vt.T / self.singular / self.scale[:, None]) @ self.basis.T
 
-    def covariance(self) -> Values:
-        """Return ``(A^T A)^-1`` of the determined combinations: (p, p) array."""
-        keep = slice(self.rank)
-        half: Values = self.Vt[keep].T / self.singular[keep] / self.scale[:, None]
-        return half @ half.T
-
     def undetermined(self, names: Sequence[str], share: float = PART_OF_NULL_SPACE) -> list[str]:
         """Return the names of the parameters with at least ``share`` in undetermined combinations."""
         parts = np.linalg.norm(self.Vt[self.rank :], axis=0)

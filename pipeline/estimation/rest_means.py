@@ -281,7 +281,8 @@ def rests_of(
     chosen: dict[int, list[Rest]] = {}
     held: set[tuple[int, int]] = set()
     for index, recording in enumerate(recordings):
-        if recording.role == role and recording.reading(sensor) is not None and _rests(recording, sensor):
+        moving = sensor == "gyroscope" and recording.kind == "slow"  # it shows the length of gravity alone
+        if recording.role == role and recording.reading(sensor) is not None and not moving:
             split = split_rests(recording, every)
             rests = sorted([*split.used, *split.held_out], key=lambda rest: rest.start)
             chosen[index] = [r for r in rests if (recording.name, float(recording.time[r.start])) not in refused]
@@ -407,11 +408,6 @@ def _before(recording: Recording, sensor: str, span: Index) -> Values:
     known = (earlier >= 0) & (counts[earlier] > 0) if every else np.zeros(len(span), bool)
     found[known] = means[earlier[known]]
     return found
-
-
-def _rests(recording: Recording, sensor: str) -> bool:
-    """Return whether a sensor rests: in slow movement, which shows the length of gravity, the gyroscope does not."""
-    return sensor == "accelerometer" or recording.kind != "slow"
 
 
 @once

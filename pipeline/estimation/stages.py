@@ -371,8 +371,7 @@ def fit_stage(
     check_stages(sensor, [*declarations(previous), stage] if previous else [stage])
     known = known_effects(sensor, settings.method)
     if declared(sensor, stage).known:
-        named = [(f"{effect.name}.{name}", p) for effect in known for name, p in effect.parameters.items()]
-        parameters = {name: Estimate(p.value, p.unit) for name, p in named}
+        parameters = {f"{e.name}.{n}": Estimate(p.value, p.unit) for e in known for n, p in e.parameters.items()}
         return SensorCalibration(sensor, effects=known, stages=(StageResult(stage, parameters),))
     for other in SENSORS:
         if other != sensor and (of_other := known_effects(other, settings.method)):

@@ -261,7 +261,8 @@ class RowGroups:
         resting, known = motion.still[self.kept[self.first]], self.all(motion.reference_valid)
         found = motion.mapped(self.means, still=resting, reference_valid=known)
         logged, long = motion.at_offset, self.count.max(initial=0.0) > ALL_SAMPLES
-        if motion.axis is not None and logged and long and _step(motion) <= FINEST_STEP_S:
+        step = float(np.ptp(motion.time)) / max(len(motion.time) - 1, 1)
+        if motion.axis is not None and logged and long and step <= FINEST_STEP_S:
             still = cache(lambda: logged(rows=self._pieces))  # the same integrals of the motion that is not shifted
             return self._with_trajectory(found, motion, partial(self._mean_at, found, still))
         return self._with_trajectory(found, motion, self._at)
@@ -325,10 +326,6 @@ class RowGroups:
         found: dict[str, Any] = {name: partial(later, name) for name in MOVED_FIELDS}
         found["reference_valid"] = lambda: moved.reference_valid
         return self._with_trajectory(here.changed(**found), moved, partial(self._mean_at, here, logged))
-
-
-def _step(motion: Motion) -> float:
-    return float(np.ptp(motion.time)) / max(len(motion.time) - 1, 1)
 
 
 def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> RowGroups:

@@ -47,7 +47,8 @@ class Solved:
     def covariance(self) -> np.ndarray[Any, Any]:
         """Covariance of the parameters by the scatter of the residuals."""
         variance = self.residual @ self.residual / self.degrees_of_freedom
-        return np.asarray(variance * ScaledColumns.of(self.columns).covariance())
+        weights = ScaledColumns.of(self.columns).weights()
+        return np.asarray(variance * weights @ weights.T)
 
     @property
     def standard_uncertainty(self) -> np.ndarray[Any, Any]:

@@ -159,10 +159,10 @@ def fit(task: StageInput) -> SensorCalibration:
     The recordings are rests in many orientations (role ``rests``), or a table's turns (role ``accelerometer``). Where
     the procedure states faces, the full matrix is fitted (``pipeline.estimation.multi_position.result``).
     """
-    if not task.settings.procedure.faces:
-        return _fit_triangular(task)
-    require_faces(task.recordings.filtered, task.settings.procedure)
-    return fit_faces(_fit_triangular(task), task.recordings, task.settings)
+    if task.settings.procedure.faces:
+        require_faces(task.recordings.filtered, task.settings.procedure)
+    found = _fit_triangular(task)
+    return fit_faces(found, task.recordings, task.settings) if task.settings.procedure.faces else found
 
 
 def triangle(values: Values) -> Values:

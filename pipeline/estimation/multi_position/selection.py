@@ -272,12 +272,8 @@ class SelectionByHand:
             return False
         gain = 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
         significant = passes(score, self.model.sensor, len(self.candidates), gain)
-        return score.admissible and significant and self._possible(score)
-
-    def _possible(self, score: Score) -> bool:
-        """Return whether an effect needs no more than ten times its limits: beyond, it is no explanation."""
-        least = np.abs(score.values) - 2.0 * score.uncertainty
-        return bool(np.all(least <= POSSIBLE * self.limits[score.name]))
+        least = np.abs(score.values) - 2.0 * score.uncertainty  # beyond ten times its limits it is no explanation
+        return score.admissible and significant and bool(np.all(least <= POSSIBLE * self.limits[score.name]))
 
     def _add(self, score: Score, scored: CandidateScores) -> None:
         near = self._with(self.names, score, scored)

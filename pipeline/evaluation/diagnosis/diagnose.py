@@ -384,9 +384,8 @@ def without_diagnosis(sensor: str, effects: Effects, code: str, message: str) ->
 def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: str) -> SensorDiagnosis:
     """Return the diagnosis for recordings that cannot show any effect; ``needed``: what to record."""
     names = [name for name, each in catalogue().items() if sensor in each.sensors and name not in configured]
-    return SensorDiagnosis(
-        Verdict.NOT_ENOUGH_DATA, configured, not_observable=dict.fromkeys(names, reason), next_experiment=needed
-    )
+    hidden = dict.fromkeys(names, reason)
+    return SensorDiagnosis(Verdict.NOT_ENOUGH_DATA, configured, not_observable=hidden, next_experiment=needed)
 
 
 def effective_noise(

@@ -239,10 +239,8 @@ def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Estimate], b
         if score.name in findings.limits:
             plausible = bool(np.all(np.abs(values) - 2.0 * uncertainty <= findings.limits[score.name]))
     described = effect(score.name).of_recordings(findings.turns).parameters(findings.sensor)
-    return {
-        p.name: Estimate(float(v), p.unit, float(u) if u > 0 else None)
-        for p, v, u in zip(described, values, uncertainty, strict=True)
-    }, plausible
+    found = zip(described, values, uncertainty, strict=True)
+    return {p.name: Estimate(float(v), p.unit, float(u) if u > 0 else None) for p, v, u in found}, plausible
 
 
 def _wander(findings: Findings) -> Wander:

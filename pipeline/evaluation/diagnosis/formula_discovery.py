@@ -343,11 +343,9 @@ def search(grammar: Forms) -> tuple[list[ScoredForm], list[ScoredForm]]:
     """Return the terms of the best form, none if none is clear, and all forms of one term, best first."""
     terms: list[ScoredForm] = []
     first = ranked = grammar.ranked()
-    while (
-        ranked
-        and ranked[0].clear
-        and (not terms or ranked[0].gain.delta_bic > MIN_FURTHER_GAIN_SHARE * terms[0].gain.delta_bic)
-    ):
+    while ranked and ranked[0].clear:
+        if terms and ranked[0].gain.delta_bic <= MIN_FURTHER_GAIN_SHARE * terms[0].gain.delta_bic:
+            break
         terms.append(ranked[0])
         if len(terms) == MAX_FORMULA_TERMS:
             break

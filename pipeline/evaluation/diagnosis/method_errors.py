@@ -67,10 +67,8 @@ def method_errors(
         free = fit_terms(selection.observations, [*free.terms, *more], free, selection.settings)
     of_free = free.covariance, np.kron(calibration.matrix, np.eye(3))
     difference = _Difference.of(calibration, free.bias, free.K, of_free, settings)
-    of_turns, of_held_out = (
-        _errors(difference, free, [r for r in recordings if r.role == role], settings.table)
-        for role in (calibration.sensor, "validation")
-    )
+    of_roles = ([r for r in recordings if r.role == role] for role in (calibration.sensor, "validation"))
+    of_turns, of_held_out = (_errors(difference, free, each, settings.table) for each in of_roles)
     shares = {
         "held_out_share": _shares({name: _rms(error) for name, (error, _) in of_held_out.items()}),
         "held_out_magnitude_share": _shares({name: _rms(error) for name, (_, error) in of_held_out.items()}),

@@ -122,12 +122,8 @@ def listed(words: Sequence[str], conjunction: str = "and") -> str:
 
 def _said(answer: Answer) -> str:
     """Return an answer of an answer set in words, with its probability."""
-    names = [
-        f"something else that follows the {name.removeprefix(OTHER_PREFIX)}"
-        if name.startswith(OTHER_PREFIX)
-        else plain(name)
-        for name in answer.effects
-    ]
+    pairs = [(name, name.removeprefix(OTHER_PREFIX)) for name in answer.effects]
+    names = [plain(name) if name == own else f"something else that follows the {own}" for name, own in pairs]
     return f"{' + '.join(names) or 'nothing'} ({answer.probability:.2g})"
 
 

@@ -92,10 +92,8 @@ NORMAL_FREEDOM = 1e6  # beyond which a chi-square is normal to 1e-3
 def error_breakdown(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[list[StepErrors], list[str]]:
     """Return the errors after each step, and notes on effects that the samples cannot show."""
     stages = [(f"stage:{stage.name}", stage.correction) for stage in calibration.stages if stage.correction is not None]
-    figures = [
-        _figures(name, [_uncorrected(s, corrected(correction or (), s.reading)) for s in samples])
-        for name, correction in [("raw", None), *stages]
-    ]
+    steps = [("raw", ()), *stages]
+    figures = [_figures(name, [_uncorrected(s, corrected(c, s.reading)) for s in samples]) for name, c in steps]
     figures.append(_figures("calibrated", [_with_effects(calibration, (), s) for s in samples]))
     shown: list[FittedEffect] = []
     notes = []

@@ -144,11 +144,8 @@ class HeldOutCase:
         if self.by_hand:  # without a log of the motion the specific force between the rests is unknown
             logs = ("table_attitude", "table_rate", "table_angle")
             chosen = [r for r in chosen if any(getattr(r, log) is not None for log in logs)]
-        found = [
-            samples_of_motion(sensor, r, self.noise, table, other=self.other, smoothed=smoothed, followed=followed)
-            for r in chosen
-            if r.role == role
-        ]
+        known = partial(samples_of_motion, other=self.other, smoothed=smoothed, followed=followed)
+        found = [known(sensor, r, self.noise, table) for r in chosen if r.role == role]
         return [s for s in found if s is not None and np.isfinite(s.reading).all(axis=1).any()]
 
     def _means(self, recording: Recording, rests: Sequence[Rest]) -> Samples | None:

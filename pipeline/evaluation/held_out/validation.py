@@ -313,10 +313,8 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
 
 def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
     """Return the rms error by noise alone, and the vector rms error by noise alone where an attitude is known."""
-    squares = [
-        squared_norm_errors(reference_vector(calibration, s)[s.known], calibration.matrix, s.variance[s.known])
-        for s in samples
-    ]
+    known = [(reference_vector(calibration, s)[s.known], s.variance[s.known]) for s in samples]
+    squares = [squared_norm_errors(truth, calibration.matrix, variance) for truth, variance in known]
     floor = float(np.sqrt(np.mean(np.concatenate(squares))))
     if not all(breakdown.direction_known(calibration, s) for s in samples):
         return floor, None
