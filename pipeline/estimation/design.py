@@ -117,6 +117,10 @@ class EffectColumns:
         of = self.effect.columns if self.full else self.effect.regressors
         return of(sensor, motion, K, self.values)
 
+    def columns(self, sensor: str, motion: Motion, K: Values) -> Values:
+        """Return the columns of all parameters: (n, 3, p) array."""
+        return self.effect.columns(sensor, motion, K, self.values)
+
 
 Terms: TypeAlias = Sequence[EffectColumns]
 

@@ -133,7 +133,7 @@ class AccelerometerModel:
 
     def equations(self, state: State, candidates: Terms = ()) -> Equations:
         """Return the linearised equations at given parameters."""
-        rests = self.rests
+        rests, K = self.rests, state.K
         force, v = self.specific_force(state, rests)
         length = np.linalg.norm(force, axis=1)
         n = force / length[:, None]
@@ -145,10 +145,7 @@ class AccelerometerModel:
         base = np.concatenate([-along, (n[:, :, None] * v[:, None, :]).reshape(-1, 9)], axis=1)
 
         def effect_columns(term: EffectColumns) -> Values:
-            def columns(motion: Motion) -> Values:
-                return term.effect.columns(self.sensor, motion, state.K, term.values)
-
-            return self._at_rests(rests, self.gravity * n, columns, after)
+            return self._at_rests(rests, self.gravity * n, lambda motion: term.columns(self.sensor, motion, K), after)
 
         of_rests = EquationBlock(
             (target - length) / error,
@@ -210,7 +207,7 @@ class AccelerometerModel:
             bias[c, :, c, t - len(soaks.time) :] = C * self.white[c] / error[:, c, None]
 
         def columns(term: EffectColumns) -> Values:
-            Z = term.effect.columns(self.sensor, motion, state.K, term.values)
+            Z = term.columns(self.sensor, motion, state.K)
             return np.asarray((np.einsum("ij,jcp->icp", C, Z) / error[:, :, None]).reshape(3 * k, -1))
 
         return EquationBlock(

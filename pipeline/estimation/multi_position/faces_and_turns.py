@@ -306,7 +306,7 @@ class TurnsByHand:
         matrix = np.einsum("rti,tj->rij", rows, total).reshape(-1, 9)
 
         def columns(term: EffectColumns) -> Values:
-            Z = term.effect.columns("gyroscope", motion, state.K, term.values)
+            Z = term.columns("gyroscope", motion, state.K)
             integrals = self.weight[:, None] @ Z.reshape(*self.weight.shape, -1)  # (t, 1, 3 p)
             return np.asarray(-WM.reshape(len(error), -1) @ integrals.reshape(WM[0].size, -1) / error[:, None])
 

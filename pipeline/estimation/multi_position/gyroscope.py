@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
     from pipeline.core.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
     from pipeline.core.settings import Procedure
-    from pipeline.estimation.design import EffectColumns, Terms
+    from pipeline.estimation.design import Terms
     from pipeline.estimation.multi_position.fit import FitByHand
     from pipeline.estimation.rest_means import Rests
 
@@ -173,15 +173,10 @@ class GyroscopeModel:
         bias = np.zeros((3, m, 3, m))
         for c in range(3):
             bias[c, np.arange(m), c, np.arange(m)] = self.white[c] / error[:, c]
-
-        def columns(term: EffectColumns) -> Values:
-            Z = term.effect.columns(self.sensor, motion, K, term.values) / error[:, :, None]
-            return np.asarray(Z.reshape(3 * m, -1))
-
         return EquationBlock(
             (residual / error).ravel(),
             base.reshape(3 * m, BASE_COUNT),
-            columns,
+            lambda term: (term.columns(self.sensor, motion, K) / error[:, :, None]).reshape(3 * m, -1),
             error.ravel(),
             bias.reshape(3, 3 * m, m),
             (rests.start, rests.length, rests.recording),
@@ -232,12 +227,7 @@ class GyroscopeModel:
         base = np.concatenate([by_bias, turned.reshape(moves.count, 2, 9)], axis=2)
         bias = np.zeros((3, moves.count, 2, moves.count))
         bias[:, k, :, k] = (W @ (by_bias * self.white)).transpose(0, 2, 1)
-        rows = -W @ PM
-
-        def columns(term: EffectColumns) -> Values:
-            Z = term.effect.columns(self.sensor, motion, state.K, term.values)
-            return np.asarray((rows @ Z.reshape(moves.count, rows.shape[2], -1)).reshape(n, -1))
-
+        rows, K = -W @ PM, state.K
         apart = np.degrees(np.einsum("kej,kj->ke", E, self.after - predicted))
         WD = np.einsum("kij,kjmc->kimc", W, D).reshape(n, -1, 3)
         shared = np.einsum("nmc,mcp->np", WD, gravity.shared)
@@ -247,7 +237,7 @@ class GyroscopeModel:
         return EquationBlock(
             np.einsum("kij,kj->ki", W, apart).ravel() - shared @ gravity.moved,
             (W @ base).reshape(n, BASE_COUNT),
-            columns,
+            lambda term: (rows @ term.columns(self.sensor, motion, K).reshape(*rows.shape[::2], -1)).reshape(n, -1),
             error,
             bias.reshape(3, n, moves.count),
             (moves.time[:, 0], moves.time[:, -1] - moves.time[:, 0], self.every.recording[moves.after]),
