@@ -411,13 +411,11 @@ def calibration_of(
     errors = _residual_noise(design, observations, prior.grid(float(np.sqrt(np.mean(design.scale**2)))), reference)
     values = np.concatenate([base_values(fit.bias, fit.K), *(term.values for term in fit.terms)])
     of_channels = np.concatenate(first.derivative, axis=1)
-
-    def results(drawn: Values) -> Values:
-        return with_matrix(values + drawn @ of_channels.T)
-
     lines = [noise_contribution(errors, whole, prior)]
     for name, prior_part in design.prior_covariances(fit.setting).items():
         remark = FIXED_AT_ZERO if name == TILT and not observations.levelling_deg else ""
         part, freedom = change @ prior_part @ change.T, np.full(len(change), np.inf)
         lines.append(Contribution(name.replace("_", " "), "B", NORMAL, part, freedom, remark=remark))
-    return budgeted(found, reference, whole, errors, lines, settings, results, names)
+    return budgeted(
+        found, reference, whole, errors, lines, settings, lambda e: with_matrix(values + e @ of_channels.T), names
+    )

@@ -97,14 +97,12 @@ def fit(task: StageInput) -> SensorCalibration:
         stages=(*task.stages, result),
         convergence=linear_convergence(root * X, root * (y - X @ beta), condition, rank),
     )
-
-    def results(errors: Values) -> Values:
-        return with_matrix(of_channels(beta.T.ravel() + errors))
-
     bench = bench_effects(sensor, settings.table, recordings.filtered)
     if bench and not stated_priors(settings.table):  # else the stage ``effects`` fits them
         return fit_joint(sensor, recordings.filtered, bench, recordings.noises[sensor], settings, found)
-    return budgeted(found, reference, fit, noise, contributions, settings, results)
+    return budgeted(
+        found, reference, fit, noise, contributions, settings, lambda e: with_matrix(of_channels(beta.T.ravel() + e))
+    )
 
 
 def of_channels(values: Values) -> Values:
