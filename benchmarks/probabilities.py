@@ -1,9 +1,10 @@
 """Compares stated probabilities with the share that is true, for sizes that a study seldom hides.
 
-    python benchmarks/probabilities.py prior|near --n 700 [--first 0] [--seed 991] [--processes 2] [--figures FILE]
+    python benchmarks/probabilities.py prior|uniform|near --n 700 [--seed 991] [--processes 2] [--figures FILE]
 
 prior: each effect is hidden with its prior probability, at a scale and size drawn from the prior of the posterior
     (``pipeline.estimation.evidence``). There the share should be the stated probability.
+uniform: the same effects, each parameter uniform within the sensor file's limit.
 near: one effect at 0.5 to 1.5 times the size at which a selection just passes its gate (uniform). The prior draws few
     such sizes, so that the share may be smaller.
 
@@ -51,8 +52,8 @@ OF_DETECTION = 0.5, 1.5  # times the detection size
 TIME_CONSTANTS_S = 90.0, 400.0  # of a warm-up, as in a study
 
 
-def of_prior(number: int, seed: int) -> StudyCase:
-    """Draw effects and sizes from the prior."""
+def of_prior(number: int, seed: int, *, uniform: bool = False) -> StudyCase:
+    """Draw effects from the prior, and their sizes from it or uniformly within the limits."""
     rng = np.random.default_rng([seed, number, 7])
     sensor = str(rng.choice(SENSORS))
     procedure = str(rng.choice(["stop_and_go", "continuous", "one_way"], p=[0.5, 0.3, 0.2]))
@@ -65,7 +66,8 @@ def of_prior(number: int, seed: int) -> StudyCase:
     hidden = {}
     for name in names:
         scale = float(rng.choice(LIMIT_SCALES, p=np.exp(SCALE_PRIOR) / np.exp(SCALE_PRIOR).sum()))
-        values = limits[name] * scale * rng.standard_normal(len(limits[name]))
+        count = len(limits[name])
+        values = limits[name] * (rng.uniform(-1.0, 1.0, count) if uniform else scale * rng.standard_normal(count))
         if name == "warm_up":
             values[3] = np.exp(rng.uniform(*np.log(TIME_CONSTANTS_S)))
         hidden[name] = (np.abs(values) if name == DELAYS[1] else values).tolist()
@@ -81,7 +83,11 @@ def near_gate(number: int, seed: int) -> StudyCase:
     return replace(case, hidden={name: np.where(kept, values, share * np.array(values)).tolist()})
 
 
-DRAWN: dict[str, Callable[[int, int], StudyCase]] = {"prior": of_prior, "near": near_gate}
+DRAWN: dict[str, Callable[[int, int], StudyCase]] = {
+    "prior": of_prior,
+    "uniform": partial(of_prior, uniform=True),
+    "near": near_gate,
+}
 
 
 def diagnosed(sizes: str, seed: int, number: int) -> ScoredCase | None:
@@ -117,11 +123,11 @@ def main() -> None:
     # Clustered by unit: a unit has one set.
     of_sets = clustered_share(f"all answer sets, stated {mean:.4g} %", [np.array([true]) for _, true in sets])
     bins = [
-        row._replace(name=f"{of}, stated {row.name}", goal=row.goal if options.sizes == "prior" else "")
+        row._replace(name=f"{of}, stated {row.name}", goal=row.goal if options.sizes != "near" else "")
         for of in PROBABILITIES
         for row in reliability(cases, of)
     ]
-    goal = f"contains {mean:.4g} %" if options.sizes == "prior" else ""
+    goal = f"contains {mean:.4g} %" if options.sizes != "near" else ""
     figures = [*(row._replace(goal=goal) for row in of_sets), *bins]
     sys.stdout.write("\n".join(" | ".join(map(str, figure.cells)) for figure in figures) + "\n")
     if options.figures:

@@ -38,6 +38,7 @@ LOOK_ALIKE_SIGNAL_SHARE = 0.95  # share of a signal above which effects are look
 EXCESS = 0.05  # of the noise floor: smallest held-out excess that is counted
 GATES = (6.0, 8.0, MIN_DELTA_BIC, 12.0, 14.0, 16.0, 20.0, MIN_DELTA_BIC_OF_SLOW)  # at which false selections count
 OF_SENSOR_FILE = ("white", "normal")  # noise of the families that the sensor file describes
+GOOD = ("null_white", "null_normal", "null_sensors", "null_hand_white", "null_hand_normal")  # all as the sensor file
 STANDS_OUT = 100.0  # lambda: the largest that a selection needs
 DOUBTFUL_VERDICTS = (Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUBT)
 SETS = (
@@ -190,6 +191,9 @@ def family_scores(cases: Sequence[ScoredCase]) -> list[MeasuredFigure]:
         family_cases = [c for c in cases if c.family == family]
         name = f"nothing hidden, {family.removeprefix('null_')}: nothing selected"
         found += share(name, _judged(family_cases, lambda case: not case.selected), ">= 99 %")
+    good = [c for c in cases if c.family in GOOD and not c.refused]
+    sure = _judged(good, lambda case: case.verdict not in DOUBTFUL_VERDICTS)
+    found += share("nothing hidden, all as the sensor file: the verdict states no doubt", sure, ">= 99 %")
     by_hand = [c for c in cases if c.family.startswith("hand_")]
     seen = [c for c in by_hand if not c.error and not set(c.hidden) <= set(c.not_observable)]
     found += share("by hand, one effect that the recordings can show: named first", _judged(seen, first_is_right))

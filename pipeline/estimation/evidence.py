@@ -28,7 +28,7 @@ Pick: TypeAlias = tuple[int, int]  # version and scale of an effect
 Mixture: TypeAlias = "tuple[Values, Values, Values]"
 EffectSet: TypeAlias = frozenset[str]
 
-# The prior was chosen on 738 simulated sensors: docs/evidence.md.
+# Chosen on 738 simulated sensors; stated probabilities and the share that is true: docs/evidence.md.
 LIMIT_SCALES = np.array([0.02, 0.06, 0.2, 0.6, 2.0, 20.0])  # of the sensor file's limits
 SCALE_PRIOR = np.log([0.2375, 0.2375, 0.2375, 0.2375, 0.03, 0.02])
 NEGLIGIBLE_MIXTURE_WEIGHT = 1e-4  # weight below which a hypothesis or a component of a mixture is not used

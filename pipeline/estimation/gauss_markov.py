@@ -51,7 +51,7 @@ RANDOM_WALK = 8.0  # correlation time over the measured one, with the same varia
 # simulated random walks 17 showed an invented effect without it, and 6 with it.
 WALK_RATIO, WALK_TIME, WALK_SHARE = 8.0, 64.0, 0.3
 LARGEST_SPAN = 1e9  # of variances that a factorisation resolves: 1e7 times the rounding of a double
-# share of white noise's spectrum, see ``constant_bias_s``: right answers as with 0.05 (docs/evidence.md)
+# share of white noise's spectrum, see ``constant_bias_s``: right answers as with 0.05 in the blind study
 SLOW_SPECTRUM_SHARE = 0.3
 # correlation time below which ``information`` replaces the model, because its blocks last seconds
 MIN_MODELLED_TIME_S = 25.0

@@ -41,7 +41,7 @@ Result = TypeVar("Result")
 ROLES = ("accelerometer", "gyroscope", "static")
 BIAS_BLOCKS = 300  # of the bias: their length is below a tenth of the shortest correlation time of the grid
 SHORTEST_BLOCK_S = 4.0  # a fraction of the shortest correlation time of the grid
-MAX_BIAS_BLOCKS = 600  # if the bias changes within longer ones: as many as give the right answers (docs/evidence.md)
+MAX_BIAS_BLOCKS = 600  # if the bias changes within longer ones: as many as give the right answers in the blind study
 # error by unknown rates in the filter's output: share of the largest rate; deg/s
 FORGOTTEN_RATE_SHARE, FORGOTTEN_DPS = 1e-5, 1e-4
 LONGEST_RESPONSE = 400  # samples of a filter's impulse response on each side

@@ -35,8 +35,9 @@ def missing(name: str, values: Mapping[str, float], u: float) -> SensorDiagnosis
     estimates = {symbol: Estimate(value, "1", u) for symbol, value in values.items()}
     entry = Candidate(name, 100.0, 1e-9, estimates, 0.9, None, None, {}, plausible=False)
     return SensorDiagnosis(
-        Verdict.MISSING_EFFECT, [], selected=[name], ranking=[entry], override=f"effects.gyroscope=[{name}]"
-    )
+        Verdict.MISSING_EFFECT, [], 1.5, [name], [entry], override=f"effects.gyroscope=[{name}]",
+        decided_by=f"evidence for {name}, delta BIC 100",
+    )  # fmt: skip
 
 
 def bias_temperature(factor: float, u: float = 0.001) -> SensorDiagnosis:
@@ -46,6 +47,7 @@ def bias_temperature(factor: float, u: float = 0.001) -> SensorDiagnosis:
 
 def assert_no_cause(found: SensorDiagnosis, name: str, words: str) -> None:
     assert (found.verdict, list(found.selected), found.override) == (Verdict.UNEXPLAINED, [], "")
+    assert found.decided_by == "misfit of the fit, 1.5 x noise"
     assert list(found.candidates) == [name]
     assert words in found.candidates[name]
     assert words in found.reason

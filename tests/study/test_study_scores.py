@@ -109,9 +109,12 @@ def test_a_fault_is_a_miss() -> None:
 
 def test_both_sensors_of_a_unit_count_where_nothing_is_hidden() -> None:
     null = truth(key="null_white-00003")
-    lines = [said(key=null["key"]), said("a", key=null["key"], sensor="accelerometer")]
-    (score,) = family_scores(cases_of([null], lines))
-    assert (score.value, score.total, score.misses) == (0.5, 2, ("null_white-00003 accelerometer",))
+    doubted = {"sensor": "accelerometer", "verdict": "unexplained"}
+    lines = [said(key=null["key"]), said("a", key=null["key"], **doubted)]
+    selected, sure = family_scores(cases_of([null], lines))
+    for score in (selected, sure):
+        assert (score.value, score.total, score.misses) == (0.5, 2, ("null_white-00003 accelerometer",))
+    assert "states no doubt" in sure.name
 
 
 def test_tables_count_what_was_said() -> None:

@@ -48,7 +48,7 @@ from pipeline.core.records import (
     Values,
 )
 from pipeline.core.settings import Effects, Settings, Table, Uncertainty
-from pipeline.core.verdicts import Verdict
+from pipeline.core.verdicts import Verdict, decided_words
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
 from pipeline.estimation.design import OTHER_PREFIX
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
@@ -98,6 +98,7 @@ def without_harmful(found: SensorDiagnosis, harmful: Mapping[str, str]) -> Senso
     return replace(
         found,
         verdict=Verdict.UNEXPLAINED if missing else found.verdict,
+        decided_by=decided_words("misfit", found.residual_over_noise) if missing else found.decided_by,
         selected=left,
         candidates={**found.candidates, **harmful},
         reason=f"{found.reason} {told[0].upper()}{told[1:]}.".strip(),
@@ -115,6 +116,7 @@ def without_impossible(found: SensorDiagnosis, case: DiagnosisInput) -> SensorDi
     return replace(
         found,
         verdict=found.verdict if doubted else Verdict.UNEXPLAINED,
+        decided_by=found.decided_by if doubted else decided_words("misfit", found.residual_over_noise),
         selected=(),
         candidates={**found.candidates, **reasons},
         reason=f"{found.reason} {told[0].upper()}{told[1:]}.".strip(),
