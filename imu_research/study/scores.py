@@ -19,10 +19,10 @@ import scipy
 
 from imu_research.figures import MeasuredFigure, clustered_share, share
 from pipeline.core.verdicts import Verdict
-from pipeline.estimation.design import OTHER_PREFIX
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW
 from pipeline.output.pages.chart import Dots, Figure, LineMark, Panel, chart
 from pipeline.physics.effects import effect
+from pipeline.physics.effects.free_curves import OTHER_PREFIX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

@@ -10,11 +10,12 @@ import numpy as np
 from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.core.records import Motion, Recording, SensorCalibration, Values
 from pipeline.core.settings import DataSheet, Settings, Table
-from pipeline.estimation.design import MAX_BEND_SHARE_OF_ROOM, Bend, EffectColumns, NormalPrior, Terms, placed
+from pipeline.estimation.design import EffectColumns, NormalPrior, Terms, placed
 from pipeline.estimation.gates import possible
 from pipeline.estimation.observations import Observations
 from pipeline.physics.effects import catalogue, effect, stated_priors
 from pipeline.physics.effects.base import Effect, parameter_limits
+from pipeline.physics.effects.free_curves import MAX_BEND_SHARE_OF_ROOM, Bend
 from pipeline.physics.effects.mounting import SETUP_EFFECTS
 from pipeline.physics.signal.filters import MIN_SWING_DEGC, heats_and_cools
 

@@ -27,7 +27,7 @@ import scipy
 
 from pipeline.core.records import BASE_COUNT, Values
 from pipeline.estimation.candidates import SECOND, SECOND_SHARE, time_constants
-from pipeline.estimation.design import BEND, Design, EffectColumns, free_curves, placed
+from pipeline.estimation.design import Design, EffectColumns, placed
 from pipeline.estimation.evidence import (
     LIMIT_SCALES,
     NEGLIGIBLE_MIXTURE_WEIGHT,
@@ -49,6 +49,7 @@ from pipeline.estimation.ranking import MIN_NEW_COLUMN_SHARE, without
 from pipeline.estimation.selection import DELAYS, Selection
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.base import Effect
+from pipeline.physics.effects.free_curves import BEND, free_curves
 
 INCLUSION = 0.02  # prior probability of each effect
 FIRST_VERSION_AND_SCALE = 0, 3  # version and scale at which the search for the best ones of a set begins

@@ -13,7 +13,6 @@ from scipy.special import logsumexp
 
 from pipeline.core.records import Motion
 from pipeline.estimation.candidates import time_constants
-from pipeline.estimation.design import BEND, free_curves
 from pipeline.estimation.evidence import (
     LIMIT_SCALES,
     SCALE_PRIOR,
@@ -25,6 +24,7 @@ from pipeline.estimation.evidence import (
 )
 from pipeline.estimation.posterior import ODDS, UPPER_LIMIT_SHARE, Answers, SetSearch, answers, quantiles
 from pipeline.estimation.ranking import without
+from pipeline.physics.effects.free_curves import BEND, free_curves
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

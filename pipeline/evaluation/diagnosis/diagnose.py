@@ -50,7 +50,6 @@ from pipeline.core.records import (
 from pipeline.core.settings import Effects, Settings, Table, Uncertainty
 from pipeline.core.verdicts import Verdict, decided_words
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
-from pipeline.estimation.design import OTHER_PREFIX
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
 from pipeline.estimation.gates import TIMES_POSSIBLE, possible
 from pipeline.estimation.noise import with_noises
@@ -71,6 +70,7 @@ from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, samples_o
 from pipeline.evaluation.held_out.validation import HeldOutError, last_error, static_error
 from pipeline.physics.effects import catalogue, effect, effect_of
 from pipeline.physics.effects.base import parameter_limits, truth, unit_of
+from pipeline.physics.effects.free_curves import OTHER_PREFIX
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.measurement import linear_truth
 from pipeline.physics.statements import not_determined

@@ -33,7 +33,7 @@ from pipeline.core.records import (
 )
 from pipeline.core.settings import DataSheet, Settings
 from pipeline.core.verdicts import Verdict
-from pipeline.estimation.design import OTHER_PREFIX, EffectColumns, placed
+from pipeline.estimation.design import EffectColumns, placed
 from pipeline.estimation.gates import MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.known_effects import known_effects
@@ -43,6 +43,7 @@ from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
 from pipeline.evaluation.diagnosis.verdict import if_observable
 from pipeline.evaluation.diagnosis.words import experiment_of, listed, of_unknown, plain, to_distinguish
 from pipeline.physics.effects import catalogue, effect
+from pipeline.physics.effects.free_curves import OTHER_PREFIX
 
 IMITATED = 0.5  # share of an unexplained sensor's answers in which effects of the catalogue are imitations: undecided
 LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings

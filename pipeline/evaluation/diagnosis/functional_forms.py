@@ -21,9 +21,9 @@ from typing import TypeAlias
 import numpy as np
 
 from pipeline.core.records import Motion, Values
-from pipeline.estimation.design import CURVE_DEGREE
 from pipeline.estimation.observations import Observations
 from pipeline.physics.effects.base import truth, unit_of
+from pipeline.physics.effects.free_curves import CURVE_DEGREE
 from pipeline.physics.formula import parse
 
 CYCLES = range(1, 13)

@@ -47,7 +47,7 @@ from numpy.polynomial.chebyshev import chebvander
 
 from pipeline.core.files import JSON
 from pipeline.core.records import BASE_COUNT, Dependence, Index, Motion, Noise, Values
-from pipeline.estimation.design import CURVE_DEGREE, MAX_CURVE_CYCLES, EffectColumns, placed
+from pipeline.estimation.design import EffectColumns, placed
 from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Blocks, GaussMarkov, Products, Setting, selection_grid
 from pipeline.estimation.multi_position import selection as by_hand
@@ -58,6 +58,7 @@ from pipeline.evaluation.diagnosis.form_scan import ProjectedCurves, Scan, White
 from pipeline.evaluation.diagnosis.functional_forms import Curves, Span, available_signals, columns_of, signals_of
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import Layout, truth, unit_of
+from pipeline.physics.effects.free_curves import CURVE_DEGREE, MAX_CURVE_CYCLES
 from pipeline.physics.formula import parse
 
 Block = tuple[Sequence[int], int]  # curves that are tried together: the first so many of them, and each further one
