@@ -50,7 +50,7 @@ from pipeline.physics.effects.base import Effect, EffectParameter, Layout, Owner
 MAX_SELECTION_ROUNDS = 3 * MAX_SELECTED_EFFECTS
 POSSIBLE = 10.0  # times its limits, beyond which an effect is no explanation
 MAX_TIMES_LIMIT = 5.0  # times its limits, which bound an amplitude that a time constant leaves undetermined
-DRIFT, LAG = "bias_drift", "temperature_lag"
+DRIFT, LAG, WARM_UP = "bias_drift", "temperature_lag", "warm_up"
 ONE_CYCLE = "the soak passes no temperature twice in one direction, so hysteresis looks like it: heat and cool twice"
 FEWEST_PARTS = 8  # of a soak that heats and cools
 TURNING = 0.2  # of the largest rate of the temperature: where it turns round
@@ -131,7 +131,8 @@ class SelectionByHand:
             state = self._state([name for name in self.names if name != LAG])
             loops = loops_of(model, state.terms)
             if loops and is_hysteresis(judged_curves(model.equations(state, loops), self.hypotheses)):
-                self.candidates = [e for e in self.candidates if e.name != LAG]
+                loop_like = {LAG} if model.rests.repeats else {LAG, WARM_UP}  # a warm-up, in one cycle
+                self.candidates = [e for e in self.candidates if e.name not in loop_like]
                 self._search()
         parts = [self._fitted(self.names[:count]) for count in range(1, len(self.names))]
         self.fits = [self.base, *parts, self.fit] if self.names else [self.base]

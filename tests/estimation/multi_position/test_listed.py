@@ -563,6 +563,7 @@ def test_a_lag_is_told_from_hysteresis_where_the_temperature_moves_at_one_rate(t
     (tmp_path / "recordings.csv").write_text("file,kind\nsoak.csv,soak\n")
     found = calibrated(tmp_path, "effects.gyroscope=auto").diagnosis["gyroscope"]
     assert ("temperature_lag" in found["selected"]) is bool(lag)
+    assert ("warm_up" in {e["effect"] for e in found["ranking"]}) is bool(lag)  # in one cycle it imitates hysteresis
     assert [each["covariate"] for each in found["unexplained"]] == ([] if lag else ["temperature_hysteresis"])
 
 
