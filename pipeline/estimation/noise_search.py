@@ -60,7 +60,7 @@ LARGEST_CHANGE = 14.0  # change of the logarithm of a squared coefficient: a fac
 PROFILE_STEPS, PROFILE_PRECISE = 9, 0.02  # of the root of the loss: 2 % of half an interval
 STEADY_DEGC = 0.1  # a temperature that changes less is not a regressor: the noise of thermometers on the chip
 RAMP_TOLERANCE = 0.03  # share of a temperature's change that is no ramp, below which it is not separable from a ramp
-MOST_SINUSOIDS = 5
+MOST_SINUSOIDS = 5  # a bound of the cost: each has a fit of all terms
 # Power of a line over the level around it, in ln(n): of n independent exponential values one exceeds it with a
 # probability of 1 / sqrt(n).
 LINE_POWER = 1.5
@@ -69,8 +69,9 @@ LEVEL_BIN_RATIO = 1.1  # ratio of the edges of the bins over which the level is 
 FEWEST_OF_LEVEL = 16  # values of such a bin
 LINE_WIDTH = 4  # lines of the periodogram over which a Hann window spreads a sinusoid
 # Change of a frequency, in widths of a line, at which it has converged, and at which its power is right to 2 %.
-FREQUENCY_PRECISION, POWER_PRECISION = 0.01, 0.1
-MOST_ROUNDS = 6
+FREQUENCY_PRECISION = 0.01  # widths of a line (1 / span) by which a step moves a frequency that has settled
+POWER_PRECISION = 0.1  # the same, below which a line is judged: its power is within 4 % of the largest (sinc)
+MOST_ROUNDS = 6  # a step of Gauss and Newton doubles the digits: from half a width to a hundredth in three
 
 
 @dataclass(frozen=True)

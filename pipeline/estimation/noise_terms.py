@@ -62,7 +62,7 @@ BIN_RATIO = 1.05  # of the edges of a bin: the spectrum of a random walk changes
 LONGEST_TIME = 0.5  # correlation time, in lengths of the recording, above which a process is a random walk
 STEP_LIMITS = (-4.0, 1.5)  # largest changes of a logarithm in one iteration; an absent term falls fast
 ITERATIONS, PRECISION = 40, 1e-2  # gain in -2 log L, predicted or of the last step, that ends them; 3.84 is 95 %
-LARGEST_DAMPING = 1e4
+LARGEST_DAMPING = 1e4  # of Levenberg and Marquardt: steps of 1e-4 of the gradient are no progress
 LOG_LEAST = -690.0  # of a squared coefficient: above the smallest double
 
 Composition = tuple[int, ...]  # a set of stochastic terms: their kinds, in rising order

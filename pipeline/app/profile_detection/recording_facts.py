@@ -69,13 +69,13 @@ Line = tuple[str, str]
 RESTING_SHARE = 0.8  # share of a recording that lies still
 WHOLE_REST = 0.9  # share of a recording that is one rest, where the sensor did not move
 SUITS_FERRARIS = "six faces and turns about x, y and z in one file: procedure=ferraris determines more (docs/record.md)"
-SAME_ATTITUDE_DEG = 5.0
+SAME_ATTITUDE_DEG = 5.0  # as a mounting is allowed to differ (procedure.mounting_tolerance_deg)
 SWEPT_DEGC = 10.0  # as of a sweep that validation shows
 QUIET_DPS = 5.0  # range of a gyroscope at rest, of which bias over temperature is a part
 SOAKED_PARTS = 20  # whose mean directions are compared
-MIN_PROPOSED_TURN_DEG = 45.0
+MIN_PROPOSED_TURN_DEG = 45.0  # half a quarter turn, the smallest that a sheet usually states
 WHOLE, ROUND_DEG = 0.05, 1.0  # relative: a scale factor error of 3 %, and a hand; of an angle that is proposed
-SMOOTHED_S = 0.2
+SMOOTHED_S = 0.2  # means in which the direction of gravity is differentiated: a turn by hand lasts seconds
 CLEARER = 0.25  # of the sum of squares, below which another map of axes is proposed
 NO_RATE = np.zeros(3)
 GRAVITY_WITHIN = 0.2  # g, at rest: consumer sensors have biases of 0.1 g; another unit is wrong by more

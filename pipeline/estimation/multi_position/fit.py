@@ -58,7 +58,7 @@ Hypotheses: TypeAlias = Sequence[NoiseHypothesis]
 
 # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 MAX_STEP_HALVINGS = 30  # of a step; a smaller one is rounding
-MIN_NEW_NORM_SHARE = 1e-3
+MIN_NEW_NORM_SHARE = 1e-3  # of a column beside the others, below which rounding decides: as ``MIN_NEW_COLUMN_SHARE``
 REDUNDANT_RESTS = 10  # that are recommended beyond the parameters, so that residuals show the noise
 NEGLIGIBLE_LOG_LIKELIHOOD = 12.0  # of log L below the best: a weight of 6e-6
 PREDICTED_TO = 4.0  # of log L by a linear model: 9 of 10 fits of 13 simulated units differ by less than 0.5

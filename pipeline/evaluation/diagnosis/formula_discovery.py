@@ -51,7 +51,7 @@ from pipeline.physics.formula import SIGNALS, parse
 PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
 # least delta BIC of a further term over that of the first: less may be rounding of the first's constants
 MIN_FURTHER_GAIN_SHARE = 0.02
-MAX_FORMULA_TERMS = 3
+MAX_FORMULA_TERMS = 3  # as many as effects that a verdict believes at once (``BELIEVED``)
 REFINED = 16  # forms that are scored under every noise setting, and whose constants are scanned more finely
 SCAN_REFINEMENTS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
 ROWS_AT_ONCE = 8192  # whose products of columns are computed together: 20 MB

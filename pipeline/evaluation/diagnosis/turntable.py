@@ -50,7 +50,7 @@ from pipeline.evaluation.held_out.validation import noise_floors
 from pipeline.physics.effects import catalogue
 
 MOST_OF = 0.5  # share of the gain that the listed seconds have together
-MAX_INFLUENTIAL_STRETCHES = 5
+MAX_INFLUENTIAL_STRETCHES = 5  # that a page lists
 DETERMINED = 1e-6  # least information on an effect's weakest direction, over that of all recordings
 NEEDED_RECORDING = "record turns about all three axes on a table whose angle and rate are logged"
 # mean square of a residual over that of noise below which effects cannot explain a part of the excess
