@@ -121,3 +121,16 @@ def test_a_change_of_a_page_repeats_no_stage_before_the_pages() -> None:
     page = Path(unit_page.__file__)
     of = {stage: stage_settings._closure(f"pipeline.app.steps.{module}") for stage, module in MODULES.items()}
     assert {stage for stage, files in of.items() if page in files} == {"report"}
+
+
+@pytest.mark.parametrize(
+    ("module", "file"),
+    [
+        ("pipeline.app.steps.ingest", "imu_logs/names.json"),
+        ("pipeline.app.steps.report", "pipeline/output/pages/templates/unit.html"),
+        ("imu_research.study.cases", "imu_research/study/sizes.yaml"),
+    ],
+)
+def test_the_digest_of_code_holds_the_files_of_data_that_it_reads(module: str, file: str) -> None:
+    files = stage_settings._closure(module)  # noqa: SLF001  (of which the digest is)
+    assert Path(stage_settings.PACKAGE.parent, file) in files

@@ -36,6 +36,7 @@ IMPORT = re.compile(
     r"^[ \t]*(?:from ((?:pipeline|imu_)[\w.]*|jinja2) import (\([^)]*\)|.*)|import ((?:pipeline|imu_)[\w.]*))",
     re.MULTILINE,
 )
+DATA_FILE = re.compile(rb'"([\w-]+\.(?:json|yaml))"')
 SECTIONS_OF_STAGES = {**{name: step.settings for name, step in STEPS.items()}, "prior": STEPS["validate"].settings}
 
 
@@ -218,7 +219,7 @@ def code_digest(*modules: str) -> str:
     """Return a digest of the source of modules and of every module of the packages that they import, at any depth.
 
     It includes all files of a package that imports its modules by name, the folder ``templates`` of a module that
-    imports jinja2, and ``configs/effect/`` with the effects.
+    imports jinja2, files of data beside a module that names them, and ``configs/effect/`` with the effects.
     """
     name, state = "-".join(("code", *modules)), _state_of_sources()
     if (known := from_cache(name, state)) is not None:
@@ -261,6 +262,7 @@ def _imports(file: Path) -> tuple[Path, ...]:
         files += [f for f in file.parent.rglob("*") if f.is_file() and f.suffix != ".pyc"]
     if file == PACKAGE / "physics" / "effects" / "__init__.py":
         files += [f for f in sorted(EFFECTS_FOLDER.glob("*.yaml")) if b"\nbuilt_in: true" in f.read_bytes()]
+    files += [f for name in DATA_FILE.findall(source) if (f := file.parent / name.decode()).is_file()]
     for module, names, whole in IMPORT.findall(source.decode()):
         if module == "jinja2":
             files += (file.parent / "templates").glob("*")
