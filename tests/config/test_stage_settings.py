@@ -132,5 +132,5 @@ def test_a_change_of_a_page_repeats_no_stage_before_the_pages() -> None:
     ],
 )
 def test_the_digest_of_code_holds_the_files_of_data_that_it_reads(module: str, file: str) -> None:
-    files = stage_settings._closure(module)  # noqa: SLF001  (of which the digest is)
+    files = stage_settings._closure(module)
     assert Path(stage_settings.PACKAGE.parent, file) in files
