@@ -50,7 +50,7 @@ class Measure:
 
     def words(self, folder: Path, options: argparse.Namespace) -> list[str]:
         """Return the command with its files in ``folder``, for a share of the units."""
-        values = {**vars(options), "n": max(2, round(options.share * self.n))}
+        values = {**vars(options), "n": max(1, round(options.share * self.n))}
         text = self.command.format(**values, folder=folder, figures=folder / "figures.json")
         program, *rest = shlex.split(text)
         return [sys.executable if program == "python" else program, *rest]
