@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.app.config import Campaign, load_campaign
+from pipeline.app.config.campaign import find_campaign
 from pipeline.app.config.stage_settings import settings_in_memory
 from pipeline.core.errors import ConfigurationError
 
@@ -261,3 +262,13 @@ def test_stages_that_cannot_follow_each_other_are_refused_before_any_job(
     file.write_text(method)
     with pytest.raises(ConfigurationError, match=rf"method\.gyroscope=own: {words}.*own\.yaml"):
         load(directory, overrides="method=own")
+
+
+def test_a_directory_with_the_name_of_a_shipped_campaign_is_named_by_its_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo" / "units.csv").write_text("unit\n")
+    monkeypatch.chdir(tmp_path)
+    assert find_campaign("./demo") == (tmp_path / "demo").resolve()
+    assert find_campaign("demo").parent.name == "data"

@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument(
         "campaign",
         metavar="CAMPAIGN",
-        help="directory of a campaign, or the name of a shipped campaign: demo, published",
+        help="directory of a campaign (./NAME in this one), or the name of a shipped campaign: demo, published",
     )
     parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="settings for every unit (Hydra overrides)")
     add_run_options(parser)

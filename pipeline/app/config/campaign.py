@@ -204,8 +204,12 @@ def read_layers(directory: Path, settings: Mapping[str, Any]) -> tuple[Composer,
 
 
 def find_campaign(name: str) -> Path:
-    """Return the directory of a campaign: ``name`` is a campaign of the package, or a directory with ``units.csv``."""
-    for directory in (SHIPPED / "data" / name, Path(name)):
+    """Return the directory of a campaign: ``name`` is a campaign of the package, or a directory with ``units.csv``.
+
+    ``./NAME`` is a directory, also where a campaign of the package has that name.
+    """
+    of_package = [] if "/" in name or os.sep in name else [SHIPPED / "data" / name]
+    for directory in (*of_package, Path(name)):
         if os.path.lexists(directory / "units.csv"):
             return directory.resolve()
     shipped = [d.parent.name for d in SHIPPED.glob("data/*/units.csv")]
