@@ -42,7 +42,7 @@ import pandas as pd
 from imu_research.figures import share, write_figures
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import CYCLE_DEGC, NOISES, StudyCase, draw
-from imu_research.study.run import held_out_errors
+from imu_research.study.run import errors_with
 from pipeline.app.one_unit import ConfiguredUnit, unit_of_recordings
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS, Recording
@@ -247,7 +247,7 @@ def hidden(number: int, seed: int, depth: str) -> JSON:
 
     def error(names: list[str]) -> JSON:
         try:
-            return held_out_errors(unit, state, sensor, names)
+            return errors_with(unit, state, sensor, names)[0]
         except PipelineError as refused:  # what is proposed is not observable: the floor is not reached
             return {"before": 0.0, "after": None, "floor": 0.0, "error": str(refused)}
 

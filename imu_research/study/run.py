@@ -172,22 +172,29 @@ def scored(state: UnitState, sensor: str) -> JSON:
     }
 
 
-def held_out_errors(unit: ConfiguredUnit, state: UnitState, case: StudyCase, names: Sequence[str]) -> JSON:
-    """Return the held-out error before and after effects are added to a validated unit, and the noise floor.
+def errors_with(unit: ConfiguredUnit, state: UnitState, sensor: str, names: Sequence[str]) -> tuple[JSON, UnitState]:
+    """Return the held-out error before and after effects are added to a validated unit, the noise floor, and the unit.
 
-    It is the error of the vector where the attitude is logged, else of the magnitude. ``raised``: whether it rises
-    significantly (``pipeline.estimation.harm``) on motion that no step saw or, by hand, at the held-out rests. Raises
-    ``CannotCalibrateError`` if the recordings do not determine the effects.
+    It is the error of the vector where the attitude is logged, else of the magnitude. Raises ``CannotCalibrateError``
+    if the recordings do not determine the effects.
     """
-    sensor = case.sensor
     before, floor = _error(state, sensor)
-    if not names:
-        return {"before": before, "after": before, "floor": floor, "raised": False}
-    others = {other: fit for other, fit in state.fits.items() if other != sensor}
-    adding = unit.with_effects(sensor, names)
-    adding = replace(adding, stages={sensor: adding.stages[sensor]})
-    added = adding.run_to("validate", first="fit", state=replace(state, fits=others))
-    return {"before": before, "after": _error(added, sensor)[0], "floor": floor, "raised": _raised(state, added, case)}
+    added = state
+    if names:
+        others = {other: fit for other, fit in state.fits.items() if other != sensor}
+        adding = unit.with_effects(sensor, names)
+        adding = replace(adding, stages={sensor: adding.stages[sensor]})
+        added = adding.run_to("validate", first="fit", state=replace(state, fits=others))
+    return {"before": before, "after": _error(added, sensor)[0], "floor": floor}, added
+
+
+def held_out_errors(unit: ConfiguredUnit, state: UnitState, case: StudyCase, names: Sequence[str]) -> JSON:
+    """Return the errors of ``errors_with``, and whether the error is ``raised`` significantly.
+
+    That is judged (``pipeline.estimation.harm``) on motion that no step saw or, by hand, at the held-out rests.
+    """
+    errors, added = errors_with(unit, state, case.sensor, names)
+    return {**errors, "raised": bool(names) and _raised(state, added, case)}
 
 
 def _raised(state: UnitState, added: UnitState, case: StudyCase) -> bool:
