@@ -32,7 +32,7 @@ from pipeline.app.config import load_campaign
 from pipeline.app.one_unit import ConfiguredUnit, notes_of_campaign
 from pipeline.core.errors import InputError, InternalError
 from pipeline.core.verdicts import Verdict
-from pipeline.physics.effects import catalogue
+from pipeline.physics.effects import catalogue, forget
 
 if TYPE_CHECKING:
     from pipeline.app.one_unit import UnitResult
@@ -402,8 +402,11 @@ def test_effects_of_a_campaign_and_of_a_python_file_stay_with_their_unit(campaig
     assert found.apply(log).shape == (2, 3)
     found.save(tmp_path / "saved")
     file = tmp_path / "saved" / "calibrations" / "U001.json"
-    loaded = pipeline.load_calibration(file, python_effects=[python])
-    np.testing.assert_array_equal(loaded.apply(log.to_numpy()).accelerometer, found.apply(log))
+    try:
+        loaded = pipeline.load_calibration(file, python_effects=[python])  # whose effects stay in this process
+        np.testing.assert_array_equal(loaded.apply(log.to_numpy()).accelerometer, found.apply(log))
+    finally:
+        forget(*set(catalogue()) - known)
 
 
 SQUEEZED = """
