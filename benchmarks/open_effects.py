@@ -104,6 +104,16 @@ def rows_of(procedure: str, effect: str, limit: np.ndarray | None, seed: int) ->
         return []
 
 
+def at_limits() -> dict[str, np.ndarray]:
+    """Return the parameters of each effect of an MPU-6050 at the sensor file's limit, by ``<sensor>.<effect>``."""
+    settings = unit_row(["sensor=mpu6050"]).config.sensor
+    return {
+        f"{s}.{this.name}": np.where(limits > 0.0, limits, start)
+        for s in SENSORS
+        for this, start, limits in limited_effects(s, (), settings.of(s))
+    }
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -115,12 +125,7 @@ def main() -> None:
     parser.add_argument("--told", action="store_true", help="list the units that are not said to lack nothing")
     parser.add_argument("--figures", type=Path, help="file for the shares with their 99 % intervals, clustered by unit")
     options = parser.parse_args()
-    settings = unit_row(["sensor=mpu6050"]).config.sensor
-    effects = {
-        f"{s}.{this.name}": np.where(limits > 0.0, limits, start)
-        for s in SENSORS
-        for this, start, limits in limited_effects(s, (), settings.of(s))
-    }
+    effects = at_limits()
     figures: list[MeasuredFigure] = []
     for procedure in options.procedure:
         tasks = [
