@@ -13,7 +13,7 @@ that of a static recording or of the sensor file, two effects may mask each othe
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -137,6 +137,20 @@ class Selection:
         # without the designs of other fits, which would be kept as long as the unit
         self.fits = {names: fit if fit is self.fit else replace(fit) for names, fit in self.fits.items()}
 
+    def without(self, names: Collection[str]) -> Selection | None:
+        """Return the selection by the other candidates; None where their 2 log L is less by ``MIN_DELTA_BIC``."""
+        others = {name: term for name, term in self.candidates.items() if name not in names}
+        found = replace(self, steps={}, fits=dict(self.fits), fit=self.base, ranking=self.first, candidates=others)
+        found.run()
+        less = 2.0 * (self.fit.log_likelihood - found.fit.log_likelihood)
+        return found if found.names and less < MIN_DELTA_BIC else None
+
+    @property
+    def bic(self) -> float:
+        """``2 log L - k log N`` of the fit."""
+        count = sum(len(term.values) for term in self.fit.terms)
+        return 2.0 * self.fit.log_likelihood - count * float(np.log(self.ranking.samples))
+
     def with_more(self, names: Sequence[str]) -> Selection:
         """Return the selection with further effects; itself if one of them is not possible or lowers the BIC."""
         found = replace(self, steps=dict(self.steps), fits=dict(self.fits), refused=set(self.refused))
@@ -258,7 +272,7 @@ class Selection:
 
     def _possible(self, name: str, selected: Sequence[str]) -> bool:
         """Return whether an effect can be added: it contains no effect of the model, nor is contained in one."""
-        if frozenset([*selected, name]) in self.refused:
+        if name not in self.candidates or frozenset([*selected, name]) in self.refused:
             return False
         others = [*selected, *(term.effect.name for term in self.base.terms)]
         return not any(name in effect(other).contains or other in effect(name).contains for other in others)

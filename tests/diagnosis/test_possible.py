@@ -11,9 +11,10 @@ from pipeline.core.records import Candidate, Estimate, Noise, Recording, SensorC
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation import harm
 from pipeline.estimation.harm import harmful
-from pipeline.evaluation.diagnosis.diagnose import without_harmful, without_impossible
+from pipeline.evaluation.diagnosis.diagnose import _longest_by_chance, without_harmful, without_impossible
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput
 from pipeline.evaluation.diagnosis.verdict import MAX_SCATTER_BY_HAND, VerdictInput, decide
+from pipeline.physics.kinematics import EARTH_RATE_DPS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -79,6 +80,15 @@ def test_a_temperature_that_does_not_change_contradicts_an_effect_of_temperature
     assert_no_cause(
         without_impossible(bias_temperature(0.5), case_of(steady)), "bias_temperature", "temperature changes"
     )
+
+
+def test_an_estimate_of_earths_rate_exceeds_it_by_chance_in_one_of_a_thousand_units() -> None:
+    u, rng = 4e-4, np.random.default_rng(5)
+    estimates = np.array([0.0, 0.0, EARTH_RATE_DPS]) + rng.normal(0.0, u, (200_000, 3))
+    beyond = np.linalg.norm(estimates, axis=1) > _longest_by_chance(EARTH_RATE_DPS, u)
+    assert 0.0008 < np.mean(beyond) < 0.0012  # 4.5 standard deviations of 1e-3
+    found = missing("earth_rotation", {"E_x": 0.0048, "E_y": 0.0, "E_z": 0.0}, u)
+    assert without_impossible(found, case_of()) is found
 
 
 def test_no_unit_turns_faster_than_the_earth() -> None:

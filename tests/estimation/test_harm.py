@@ -113,3 +113,18 @@ def test_the_most_probable_answer_is_selected_below_the_gate_but_a_slow_effect_n
         _, state = diagnose_case(case)
         assert list(case.hidden) == selected
         assert state.diagnosis[sensor]["selected"] == selected
+
+
+def test_held_out_motion_and_limits_choose_between_sets_that_fit_alike() -> None:
+    """A tilt imitates axes with equal errors; a bias over temperature beyond its limit, drift and warm-up."""
+    for family, number, sensor, selected, candidates in (
+        ("cold", 40, "accelerometer", ["table_axis_nonorthogonality"], ["table_tilt"]),
+        ("triples", 160, "accelerometer", ["rate_dependence", "warm_up", "bias_drift"], []),
+    ):
+        case = draw(family, number, 4203)
+        _, state = diagnose_case(case)
+        part = state.diagnosis[sensor]
+        assert set(case.hidden) == set(selected)
+        assert (part["verdict"], part["selected"]) == ("missing_effect", selected)
+        assert [candidate["effect"] for candidate in part["candidates"]] == candidates
+        assert sorted(part["answer_set"][0]["effects"]) == sorted(selected)

@@ -32,6 +32,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import scipy
 
 from pipeline.core.errors import ConvergenceError, NotObservableError
 from pipeline.core.records import (
@@ -51,7 +52,7 @@ from pipeline.core.settings import Effects, Settings, Table, Uncertainty
 from pipeline.core.verdicts import Verdict, decided_words
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
-from pipeline.estimation.gates import TIMES_POSSIBLE, possible
+from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, TIMES_POSSIBLE, possible
 from pipeline.estimation.noise import with_noises
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.stages import last_fit
@@ -86,7 +87,8 @@ MIN_STRETCHES = 8  # stretches, which determine a standard deviation to a quarte
 
 
 def without_harmful(found: SensorDiagnosis, harmful: Mapping[str, str]) -> SensorDiagnosis:
-    """Return the diagnosis without the selected effects that raise the held-out error, which become candidates."""
+    """Return the diagnosis without the selected effects that raise the held-out error; all become candidates."""
+    found = replace(found, candidates={**found.candidates, **harmful})
     harmful = {name: reason for name, reason in harmful.items() if name in found.selected}
     if not harmful:
         return found
@@ -100,7 +102,6 @@ def without_harmful(found: SensorDiagnosis, harmful: Mapping[str, str]) -> Senso
         verdict=Verdict.UNEXPLAINED if missing else found.verdict,
         decided_by=decided_words("misfit", found.residual_over_noise) if missing else found.decided_by,
         selected=left,
-        candidates={**found.candidates, **harmful},
         reason=f"{found.reason} {told[0].upper()}{told[1:]}.".strip(),
         override=f"{head}[{','.join(kept)}]" if left and found.override else "",
     )
@@ -134,7 +135,7 @@ def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
     if len(limits) == len(values) and not sheet.accept_implausible and not possible(values, u, limits):
         ratio = float(np.max(np.abs(values) / limits))
         return f"it would be {ratio:.3g} times the data sheet's limit; at most {TIMES_POSSIBLE:g} times is possible"
-    if entry.effect == EARTH and np.linalg.norm(values) - 2.0 * float(np.max(u)) > EARTH_RATE_DPS:
+    if entry.effect == EARTH and np.linalg.norm(values) > _longest_by_chance(EARTH_RATE_DPS, float(np.max(u))):
         return f"{np.linalg.norm(values):.2g} deg/s is more than the Earth turns ({EARTH_RATE_DPS:.2g} deg/s)"
     if "temperature" in this.needs:
         span, resolution = _temperatures([r for r in case.recordings if r.role != "validation"])
@@ -148,6 +149,14 @@ def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
         if excess > TIMES_POSSIBLE:
             return f"the noise is {excess:.2g} times the sensor file's, so that the file is not that of this sensor"
     return ""
+
+
+def _longest_by_chance(length: float, u: float) -> float:
+    """Return the length that the estimate of a vector exceeds with the probability ``MAX_FALSE_DEPENDENCE``.
+
+    ``u``: standard uncertainty of each component. Its two components across the vector lengthen the estimate, too.
+    """
+    return float(np.hypot(length, np.sqrt(2.0) * u) + scipy.special.ndtri(1.0 - MAX_FALSE_DEPENDENCE) * u)
 
 
 def _temperatures(recordings: list[Recording]) -> tuple[float, float]:

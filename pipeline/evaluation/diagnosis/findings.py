@@ -244,6 +244,11 @@ def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Estimate], b
     return {p.name: Estimate(float(v), p.unit, float(u) if u > 0 else None) for p, v, u in found}, plausible
 
 
+def implausible(findings: Findings) -> list[str]:
+    """Return the selected effects beyond their limits."""
+    return [name for name in findings.selected if not _estimates(findings, findings.steps[name])[1]]
+
+
 def _wander(findings: Findings) -> Wander:
     """Return the most likely wander, given base, configured and selected effects, and whether it is inflated."""
     wander, best = max(findings.noises, key=lambda noise: noise[1])

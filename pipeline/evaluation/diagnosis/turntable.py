@@ -17,7 +17,7 @@ uncertainties (Cook, Technometrics 19, 1977).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +28,7 @@ from pipeline.core.records import BASE_COUNT, Index, Noise, SelectionErrors, Sen
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Design, EffectColumns, placed
-from pipeline.estimation.gates import min_delta_bic
+from pipeline.estimation.gates import MIN_DELTA_BIC, min_delta_bic
 from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import JointFit, calibration_of
 from pipeline.estimation.harm import fits_of, harmful_in_turns, harmful_on_held_out
@@ -38,7 +38,7 @@ from pipeline.estimation.posterior import completed, curves_of, posterior
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.estimation.stages import last_fit
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, implausible
 from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, why_not_suggested
 from pipeline.evaluation.diagnosis.method_errors import method_errors
 from pipeline.evaluation.diagnosis.residual_dependence import dependences, goodness_of_fit, plots
@@ -172,12 +172,33 @@ def _stretches(observations: Observations, shares: Values, of_block: Index) -> l
 def findings(case: DiagnosisInput) -> Findings:
     """Return the findings of the selection in turns on a table.
 
+    Held-out motion and limits distinguish sets that the turns do not. Where a selected effect raises the held-out
+    error, another set that explains as much and raises none takes the place of the selection; where one is beyond its
+    limits, another one that is plausible and better by a delta BIC of ``MIN_DELTA_BIC``, which the search had missed.
     Raises ``NotObservableError`` if the recordings do not determine bias and matrix.
     """
     observations = observe(case.sensor, case.recordings, case.settings.table)
     known = case.noise, case.data_sheet, case.calibration
-    selected = select(observations, case.configured, *known, accelerometer=case.accelerometer)
-    selection = completed(selected, lambda each: hidden_in(each, case.modelled))
+    first = select(observations, case.configured, *known, accelerometer=case.accelerometer)
+
+    def found_by(selected: Selection, harmful: Mapping[str, str]) -> tuple[Selection, Findings]:
+        selection = completed(selected, lambda each: hidden_in(each, case.modelled))
+        return selection, _found(selection, case, harmful)
+
+    selection, found = found_by(first, {})
+    beyond = [] if case.data_sheet.accept_implausible else implausible(found)
+    second = selection.without({*found.harmful, *beyond}) if found.harmful or beyond else None
+    if second is None or (beyond and second.bic < selection.bic + MIN_DELTA_BIC):
+        return found
+    _, other = found_by(second, found.harmful)
+    return found if implausible(other) or other.harmful.keys() & {*other.selected} else other
+
+
+def _found(selection: Selection, case: DiagnosisInput, harmful: Mapping[str, str]) -> Findings:
+    """Return the findings of a selection, with the search of a formula outside the catalogue.
+
+    ``harmful``: further effects that raise the held-out error, with the reason; no answer has them.
+    """
     unknown = dependences(selection)
 
     def search() -> Findings | None:
@@ -185,7 +206,7 @@ def findings(case: DiagnosisInput) -> Findings:
         if not discovery.suggested:
             return None
         try:
-            described = _described(discovery, case)
+            described = _described(discovery, case, harmful)
         except ConvergenceError:  # the form cannot be subtracted from held-out readings, so it is no effect of a sensor
             return None
         reason = why_not_suggested(discovery, described.hidden)
@@ -198,14 +219,14 @@ def findings(case: DiagnosisInput) -> Findings:
 
     catalogue_alone = Discovery(selection, selection, unknown)
     try:
-        described = _described(catalogue_alone, case)
+        described = _described(catalogue_alone, case, harmful)
     except ConvergenceError:  # effects are too large to be subtracted from held-out readings: no held-out error
         fitted = [r for r in case.recordings if r.role != "validation"]
-        described = _described(catalogue_alone, replace(case, recordings=fitted))
+        described = _described(catalogue_alone, replace(case, recordings=fitted), harmful)
     return replace(described, search=search)
 
 
-def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
+def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mapping[str, str]) -> Findings:
     """Return the findings of a selection and a discovery."""
     sensor, noise, selection, reported = case.sensor, case.noise, discovery.context, discovery.reported
     observations, unknown = selection.observations, discovery.unknown
@@ -225,7 +246,7 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
     at_noise = not reported.names and squares[0] < UNEXPLAINABLE_RATIO * least
     excess = squares[0] if at_noise else squares[0] - min(least, squares[-1])
     curves = curves_of(selection) if selection.names or unknown else []
-    answers = posterior(selection, never_shown(hidden, reported.names), curves)
+    answers = posterior(selection, [*never_shown(hidden, reported.names), *known_harmful], curves)
     verdict = verdict_of_selection(
         reported.names,
         unknown,
@@ -271,7 +292,7 @@ def _described(discovery: Discovery, case: DiagnosisInput) -> Findings:
         drop_alone=drop_alone,
         excess=excess,
         held_out=errors or [None] * len(fits),
-        harmful=harmful,
+        harmful={**known_harmful, **harmful},
         hidden={**hidden, **alike_with_zeros(reported)},
         unknown=unknown,
         over_noise=_over_noise(selection.base, case, reference),
