@@ -166,6 +166,8 @@ def with_unknown(found: SensorDiagnosis) -> SensorDiagnosis:
             weight[names] = weight.get(names, 0.0) + share * answer.probability
     answers = [Answer(names, p) for names, p in sorted(weight.items(), key=lambda each: -each[1])]
     within = {n: p if n.startswith(OTHER_PREFIX) else (1.0 - IMITATED) * p for n, p in found.probability.items()}
+    for name in {n for names in weight for n in names} - within.keys():  # the covariate of the residual
+        within[name] = sum(p for names, p in weight.items() if name in names)
     return replace(found, answer_set=answers, probability=within)
 
 
