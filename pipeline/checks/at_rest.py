@@ -213,7 +213,7 @@ def _moving(
     tiny = np.finfo(float).tiny
     spread = np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE
     louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * np.minimum(spread, MAX_SCATTER_DEVIATION)))
-    white = data_sheet.noise_density * np.sqrt(0.5 / recording.interval)
+    white = data_sheet.white(recording.interval)
     if len(rests):
         usual = np.minimum(usual, MAX_TIMES_RESTS * np.maximum(np.median(rests[:, 0], axis=0), white))
     elif white:

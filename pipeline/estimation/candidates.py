@@ -8,10 +8,10 @@ from itertools import pairwise, product
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, NotObservableError
-from pipeline.core.records import Motion, Recording, SensorCalibration, Values
+from pipeline.core.records import Motion, Recording, SensorCalibration, Values, standard_uncertainty
 from pipeline.core.settings import DataSheet, Settings, Table
 from pipeline.estimation.design import EffectColumns, NormalPrior, Terms, placed
-from pipeline.estimation.gates import possible
+from pipeline.estimation.gates import TIMES_POSSIBLE, within
 from pipeline.estimation.observations import Observations
 from pipeline.physics.effects import catalogue, effect, stated_priors
 from pipeline.physics.effects.base import Effect, parameter_limits
@@ -163,15 +163,19 @@ def limits_of(sensor: str, data_sheet: DataSheet) -> dict[str, Values]:
     return {name: values for name, values in limits.items() if len(values)}
 
 
+def estimates(terms: Terms, covariance: Values) -> dict[str, tuple[Values, Values]]:
+    """Return values and standard uncertainties by the effect's name; their parameters are the last of a covariance."""
+    base, u = len(covariance) - sum(len(term.values) for term in terms), standard_uncertainty(covariance)
+    return {name: (term.values, u[at]) for name, (term, at) in placed(terms, base).items()}
+
+
 def offered(names: Sequence[str], terms: Terms, covariance: Values, data_sheet: DataSheet, sensor: str) -> list[str]:
-    """Return the selected effects for ``auto``: none if one of them is not possible (``gates.possible``).
+    """Return the selected effects for ``auto``: none if one of them is not possible (beyond ``TIMES_POSSIBLE`` limits).
 
     ``terms``: of the fit, the last parameters of its ``covariance``.
     """
-    limits, base = limits_of(sensor, data_sheet), len(covariance) - sum(len(term.values) for term in terms)
-    u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    found = [(limits[name], *placed(terms, base)[name]) for name in names if name in limits]
-    every = all(possible(term.values, u[at], limit) for limit, term, at in found)
+    limits, found = limits_of(sensor, data_sheet), estimates(terms, covariance)
+    every = all(within(*found[name], limits[name], TIMES_POSSIBLE) for name in names if name in limits)
     return list(names) if every or data_sheet.accept_implausible else []
 
 

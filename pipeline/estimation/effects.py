@@ -169,7 +169,7 @@ def fit_effects_by_rests(
     hypotheses = selection_hypotheses(noise, model.kinds)
     limits = limits_of(sensor, data_sheet)
     fitted = fit_configured(model, before, names, hypotheses)
-    if plausible(model, fitted, limits):
+    if plausible(fitted, limits):
         fitted = fit_configured(model, before, names, hypotheses, limits)
     if len(fitted.residual) <= fitted.rank:
         raise NotObservableError(

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.core.records import Values, coverage_factor
+from pipeline.core.records import Values
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import Effect
 
@@ -35,6 +35,7 @@ MAX_MIN_DELTA_BIC = 30.0  # largest delta BIC that is required after effects wit
 ERROR_OF_FIRST_ORDER = 2e-4  # of the gain in 2 log L of effects: the error of their equations of first order
 MIN_ANSWER_PROBABILITY = 0.9  # nothing was selected in 1,996 sensors without an effect (e8e84f42)
 MAX_FALSE_PROBABILITY = 0.01  # of a false selection by chance, over all candidates
+TIMES_UNCERTAINTY = 2.0  # times the standard uncertainty: about 95 % (JCGM 100:2008, 6.3.3)
 TIMES_POSSIBLE = 3.0  # times the sensor file's limit: a parameter beyond, by its 95 % interval, is not possible
 MAX_FALSE_DEPENDENCE = 1e-3  # probability that a complete model seems to depend on a covariate, over all tests
 
@@ -63,6 +64,6 @@ def min_gain(this: Effect, sensor: str, parameters: int, equations: float, candi
     return max(parameters * float(np.log(equations)) + min_delta_bic(this, sensor), by_chance)
 
 
-def possible(values: Values, uncertainty: Values, limits: Values) -> bool:
-    """Return whether no parameter of an effect is beyond three times its limit, by its 95 % interval: (p,) arrays."""
-    return bool(np.all(np.abs(values) - float(coverage_factor(np.inf)) * uncertainty <= TIMES_POSSIBLE * limits))
+def within(values: Values, uncertainty: Values, limits: Values | float, times: float = 1.0) -> bool:
+    """Return ``|p| - 2 u <= times L`` for every parameter p of an effect, with its limit L: (p,) arrays."""
+    return bool(np.all(np.abs(values) - TIMES_UNCERTAINTY * uncertainty <= times * limits))

@@ -114,7 +114,7 @@ def _not_below_rounding(noise: Noise, sensor: str, recordings: Sequence[Recordin
     constant = noise.white <= SMALLEST_WHITE
     if not np.any(constant | (steps > 0.0)):
         return noise
-    stated = data_sheet.noise_density * np.sqrt(0.5 / recordings[0].interval)
+    stated = data_sheet.white(recordings[0].interval)
     white = np.maximum(np.where(constant, stated, noise.white), steps / np.sqrt(12.0))
     found = _with_stated_wander(white, data_sheet, "data_sheet" if constant.all() and stated else noise.source)
     return replace(found, step=steps, rounding=rounding) if np.any(steps > 0.0) else found
@@ -148,8 +148,7 @@ def _of_recordings(sensor: str, fitted: list[Recording], data_sheet: DataSheet) 
         return _with_stated_wander(white, data_sheet, "residual")
     if not fitted:
         raise ConfigurationError(f"no recording holds readings of the {sensor}: record static (a rest of some minutes)")
-    white = np.full(3, data_sheet.noise_density * np.sqrt(0.5 / fitted[0].interval))
-    return _with_stated_wander(white, data_sheet, "data_sheet")
+    return _with_stated_wander(np.full(3, data_sheet.white(fitted[0].interval)), data_sheet, "data_sheet")
 
 
 def _of_means_or_soaks(sensor: str, recordings: list[Recording], data_sheet: DataSheet) -> Noise:

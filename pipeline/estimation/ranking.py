@@ -16,7 +16,9 @@ import numpy as np
 import scipy
 
 from pipeline.core.records import BASE_COUNT, Index, Values, standard_uncertainty
-from pipeline.estimation.design import Design, EffectColumns, Start
+from pipeline.estimation.candidates import estimates
+from pipeline.estimation.design import Design, EffectColumns, Start, Terms
+from pipeline.estimation.gates import within
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, random_walks
 from pipeline.estimation.observations import Observations
 
@@ -42,6 +44,18 @@ class Score:
     admissible: bool = True  # whether the selected effects do not already explain its signal
     plausible: bool = True  # whether the estimates are within the sensor's limits
     drop: float = 0.0  # decrease of the unwhitened sum of squares by the estimates
+
+    def refined(self, gain: float, samples: float, terms: Terms, covariance: Values, limit: Values | float) -> Score:
+        """Return the score by a fit at the candidate's optimum; ``covariance``: see ``estimates``."""
+        gain, (values, uncertainty) = max(gain, 0.0), estimates(terms, covariance)[self.name]
+        return replace(
+            self,
+            delta_bic=gain - self.parameters * float(np.log(samples)),
+            p_value=float(scipy.special.chdtrc(self.parameters, gain)),
+            values=values,
+            uncertainty=uncertainty,
+            plausible=within(values, uncertainty, limit),
+        )
 
 
 class Ranking:
@@ -191,7 +205,7 @@ class Ranking:
                 uncertainty=uncertainty,
                 setting=best,
                 admissible=bool(weakest[i] > MIN_NEW_VARIANCE),
-                plausible=bool(np.all(np.abs(values) - 2.0 * uncertainty <= limits.get(this.name, np.inf))),
+                plausible=within(values, uncertainty, limits.get(this.name, np.inf)),
                 drop=float(2.0 * signal @ cross[i, 0] - signal @ inner[i, 0] @ signal),
             )
             yield j, score, likelihood[i]

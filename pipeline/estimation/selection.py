@@ -18,12 +18,11 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
-import scipy
 
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import Noise, SensorCalibration, Values
 from pipeline.core.settings import DataSheet
-from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
+from pipeline.estimation.candidates import candidates_for, estimates, limits_of, prior_of, starts_of
 from pipeline.estimation.design import EffectColumns, Start, Terms, ordinary_base, placed, without_unknown_motion
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gates import MAX_FALSE_PROBABILITY, MIN_DELTA_BIC, passes
@@ -226,17 +225,8 @@ class Selection:
             self.optima[key] = replace(fit)  # without its design: there are many candidates
         self.fits[*self.names, score.name] = fit = self.optima[key]
         before, _ = self.ranking.of_model(self.ranking.of_effects(self.names))
-        gain = max(2.0 * (fit.log_likelihood - before), 0.0)
-        values = fit.terms[-1].values
-        uncertainty = np.sqrt(np.diag(fit.covariance))[-len(values) :]
-        return replace(
-            score,
-            delta_bic=gain - score.parameters * float(np.log(self.ranking.samples)),
-            p_value=float(scipy.special.chdtrc(score.parameters, gain)),
-            values=values,
-            uncertainty=uncertainty,
-            plausible=bool(np.all(np.abs(values) - 2.0 * uncertainty <= self.limits.get(score.name, np.inf))),
-        )
+        gain, limit = 2.0 * (fit.log_likelihood - before), self.limits.get(score.name, np.inf)
+        return score.refined(gain, self.ranking.samples, fit.terms, fit.covariance, limit)
 
     def _best(self, scores: Sequence[Score]) -> Score | None:
         """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
@@ -274,8 +264,7 @@ class Selection:
         """Return whether an effect can be added: it contains no effect of the model, nor is contained in one."""
         if name not in self.candidates or frozenset([*selected, name]) in self.refused:
             return False
-        others = [*selected, *(term.effect.name for term in self.base.terms)]
-        return not any(name in effect(other).contains or other in effect(name).contains for other in others)
+        return not overlaps(name, [*selected, *(term.effect.name for term in self.base.terms)])
 
     def _matters(self, score: Score, partners: Sequence[int]) -> bool:
         """Return whether an effect explains a significant part of a residual that is far above the noise."""
@@ -391,10 +380,8 @@ class Selection:
         gain = 2.0 * (fit.log_likelihood - self.fit.log_likelihood)
         if gain <= (STRONG_DELTA_BIC if other == DELAYS[1] else 0.0):
             return False
-        term, at = placed(fit.terms)[other]
-        score = replace(self.steps[name], name=other, values=term.values)
-        uncertainty = np.sqrt(np.diag(fit.covariance)[at])
-        score = replace(score, delta_bic=score.delta_bic + gain, uncertainty=uncertainty)
+        old, (values, uncertainty) = self.steps[name], estimates(fit.terms, fit.covariance)[other]
+        score = replace(old, name=other, delta_bic=old.delta_bic + gain, values=values, uncertainty=uncertainty)
         self.steps = self._replaced(name, score)
         self.fits[tuple(self.names)] = fit
         self._refit()
@@ -432,3 +419,8 @@ class Selection:
             if not self._passes(steps[name], [partner]) or steps[name].p_value * number >= MAX_FALSE_PROBABILITY:
                 return
         self._accept(steps)
+
+
+def overlaps(name: str, others: Sequence[str]) -> bool:
+    """Return whether an effect contains one of the others, or is contained in one."""
+    return any(name in effect(other).contains or other in effect(name).contains for other in others)

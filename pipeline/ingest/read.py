@@ -325,7 +325,7 @@ def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, che
                 f"rest, moves or slow, or add a column {LABEL} with one text for all samples of an attitude"
             )
             raise IngestError(message, str(path), code="sheet")
-    noise = {name: sensor.of(name).noise_density * float(np.sqrt(0.5 / AVERAGED_S)) for name in SENSORS}
+    noise = {name: sensor.of(name).white(AVERAGED_S) for name in SENSORS}
     return replace(table, source={**table.source, NOISE_OF_ROWS: noise})
 
 

@@ -224,8 +224,7 @@ def default_goal(data_sheet: DataSheet, gravity: float, dwell: float) -> float:
     up = np.concatenate([np.roll(turn, axis, axis=1) for axis in range(3)])
     time = dwell * np.arange(len(up))
     R = np.exp(-np.abs(time[:, None] - time) / data_sheet.wander_time_s)
-    white = data_sheet.noise_density**2 / (2.0 * dwell)
-    C = white * np.eye(len(up)) + (data_sheet.bias_wander / gravity) ** 2 * (up @ up.T) * R
+    C = data_sheet.white(dwell) ** 2 * np.eye(len(up)) + (data_sheet.bias_wander / gravity) ** 2 * (up @ up.T) * R
     J = derivative_of(up, IDEAL)
     variance = np.diag(np.linalg.inv(J.T @ np.linalg.solve(C, J)))
     return float(f"{coverage_factor(len(up) - J.shape[1]) * np.sqrt(np.max(variance)):.2g}")
@@ -257,7 +256,7 @@ def _white_of_rest(orientations: Orientations, data_sheet: DataSheet, dwell: flo
     if white > 0.0:
         (recording, _), *_ = orientations.used
         return white / float(np.sqrt(max((dwell - WINDOW_S) / recording.interval, 1.0)))
-    return data_sheet.noise_density / float(np.sqrt(2.0 * dwell))
+    return data_sheet.white(dwell)
 
 
 def _directions(pairs: Sequence[tuple[Recording, Rest]], values: Values) -> Values:

@@ -236,7 +236,7 @@ def stated_noise(data_sheet: DataSheet, interval: float, *, long_rest: bool) -> 
     whether a long rest will determine the noise.
     """
     quantisation = 1.0 / (12.0 * data_sheet.counts_per_unit**2)
-    white = np.sqrt(data_sheet.noise_density**2 * 0.5 / interval + quantisation)
+    white = np.sqrt(data_sheet.white(interval) ** 2 + quantisation)
     wander = np.full(3, data_sheet.bias_wander)
     return Noise(np.full(3, white), wander, data_sheet.wander_time_s, "static" if long_rest else "rests")
 

@@ -48,9 +48,9 @@ import scipy
 
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import Values
-from pipeline.estimation.candidates import parameter_names
-from pipeline.estimation.design import placed
+from pipeline.estimation.candidates import estimates, parameter_names
 from pipeline.estimation.engine import ErrorMixture
+from pipeline.estimation.gates import within
 from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, stepped
 
 Limits: TypeAlias = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
@@ -537,13 +537,10 @@ def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, value
     )
 
 
-def plausible(model: Model, fitted: FitByHand, limits: Limits) -> bool:
+def plausible(fitted: FitByHand, limits: Limits) -> bool:
     """Return whether every effect is within its limits, or exceeds them by less than its uncertainty."""
-    uncertainty = np.sqrt(np.diag(fitted.covariance))
-    return all(
-        bool(np.all(np.abs(term.values) - 2.0 * uncertainty[place] <= limits.get(name, np.inf)))
-        for name, (term, place) in placed(fitted.state.terms, model.directions.shape[1]).items()
-    )
+    found = estimates(fitted.state.terms, fitted.covariance).items()
+    return all(within(*of_effect, limits.get(name, np.inf)) for name, of_effect in found)
 
 
 def adds_nothing(Q: Values, columns: Values) -> bool:

@@ -25,7 +25,7 @@ from pipeline.core.settings import DataSheet
 from pipeline.estimation.candidates import NO_SWING, limits_of, starts_of, time_constants
 from pipeline.estimation.design import EffectColumns, Terms
 from pipeline.estimation.evidence import CandidateProblem, linear_problem
-from pipeline.estimation.gates import MIN_DELTA_BIC, passes
+from pipeline.estimation.gates import MIN_DELTA_BIC, passes, within
 from pipeline.estimation.gauss_markov import random_walks
 from pipeline.estimation.multi_position.fit import (
     CEILING_TO,
@@ -43,7 +43,7 @@ from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypo
 from pipeline.estimation.posterior import Answers, SetSearch, answers, excluded
 from pipeline.estimation.ranking import Score, without
 from pipeline.estimation.rest_means import Rests
-from pipeline.estimation.selection import MAX_SELECTED_EFFECTS
+from pipeline.estimation.selection import MAX_SELECTED_EFFECTS, overlaps
 from pipeline.physics.effects import catalogue, effect, effect_from
 from pipeline.physics.effects.base import Effect, EffectParameter, Layout, Owner
 
@@ -223,7 +223,7 @@ class SelectionByHand:
             values,
             uncertainty,
             0,
-            plausible=bool(np.all(np.abs(values) - 2.0 * uncertainty <= self.limits[term.effect.name])),
+            plausible=within(values, uncertainty, self.limits[term.effect.name]),
         )
 
     def _refine(self, scored: CandidateScores, names: Sequence[str], before: float) -> None:
@@ -234,13 +234,9 @@ class SelectionByHand:
             if not curved or score.delta_bic < max(COMPETES * top, 0.0):
                 continue
             refit = self._with(names, score, scored)
-            gain = max(2.0 * (refit.log_likelihood - before), 0.0) * scored.spare[score.name]
-            scored.scores[score.name] = replace(
-                score,
-                delta_bic=gain - score.parameters * float(np.log(len(refit.residual))),
-                p_value=float(scipy.special.chdtrc(score.parameters, gain)),
-                values=refit.state.terms[-1].values,
-            )
+            gain = 2.0 * (refit.log_likelihood - before) * scored.spare[score.name]
+            limit, samples, terms = self.limits[score.name], len(refit.residual), refit.state.terms
+            scored.scores[score.name] = score.refined(gain, samples, terms, refit.covariance, limit)
 
     def _state(self, names: Collection[str]) -> State:
         """Return the state of the fit with base, configured and some of the selected effects."""
@@ -268,13 +264,11 @@ class SelectionByHand:
 
     def _passes(self, score: Score, selected: Sequence[str]) -> bool:
         """Return whether a candidate passes the gate; ``selected``: effects in the model of the score."""
-        fitted = [*selected, *(term.effect.name for term in self.base.state.terms)]
-        if any(score.name in effect(name).contains or name in effect(score.name).contains for name in fitted):
+        if overlaps(score.name, [*selected, *(term.effect.name for term in self.base.state.terms)]):
             return False
         gain = 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
-        significant = passes(score, self.model.sensor, len(self.candidates), gain)
-        least = np.abs(score.values) - 2.0 * score.uncertainty  # beyond ten times its limits it is no explanation
-        return score.admissible and significant and bool(np.all(least <= POSSIBLE * self.limits[score.name]))
+        explains = score.admissible and within(score.values, score.uncertainty, self.limits[score.name], POSSIBLE)
+        return explains and passes(score, self.model.sensor, len(self.candidates), gain)
 
     def _add(self, score: Score, scored: CandidateScores) -> None:
         near = self._with(self.names, score, scored)

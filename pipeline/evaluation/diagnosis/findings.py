@@ -29,12 +29,12 @@ from pipeline.core.records import (
     TableEvidence,
     Values,
     Wander,
-    standard_uncertainty,
 )
 from pipeline.core.settings import DataSheet, Settings
 from pipeline.core.verdicts import Verdict
-from pipeline.estimation.design import EffectColumns, placed
-from pipeline.estimation.gates import MIN_DELTA_BIC
+from pipeline.estimation.candidates import estimates
+from pipeline.estimation.design import EffectColumns
+from pipeline.estimation.gates import MIN_DELTA_BIC, within
 from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
@@ -236,11 +236,9 @@ def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Estimate], b
     """Return the parameters of an effect and whether they are plausible: if selected, by the fit of all selected."""
     values, uncertainty, plausible = score.values, score.uncertainty, score.plausible
     if score.name in findings.selected:
-        base = len(findings.covariance) - sum(len(term.values) for term in findings.terms)
-        term, block = placed(findings.terms, base)[score.name]
-        values, uncertainty = term.values, standard_uncertainty(findings.covariance)[block]
+        values, uncertainty = estimates(findings.terms, findings.covariance)[score.name]
         if score.name in findings.limits:
-            plausible = bool(np.all(np.abs(values) - 2.0 * uncertainty <= findings.limits[score.name]))
+            plausible = within(values, uncertainty, findings.limits[score.name])
     described = effect(score.name).of_recordings(findings.turns).parameters(findings.sensor)
     found = zip(described, values, uncertainty, strict=True)
     return {p.name: Estimate(float(v), p.unit, float(u) if u > 0 else None) for p, v, u in found}, plausible

@@ -14,8 +14,9 @@ from unit_settings import settings_of, with_noise
 from pipeline.core.errors import NotObservableError
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.multi_position.accelerometer import model_of
+from pipeline.estimation.multi_position.fit import COMPARED_STEP
 from pipeline.estimation.multi_position.model import selection_hypotheses
-from pipeline.estimation.multi_position.selection import fit_configured, limits_of
+from pipeline.estimation.multi_position.selection import SelectionByHand, fit_configured, limits_of
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import StageInput
 from tests.published import validate
@@ -167,3 +168,15 @@ def test_derivatives_of_the_rests_are_those_of_their_residuals() -> None:
         slope = (moved[0] - moved[1]) / (2.0 * step)
         column = np.concatenate(equations.effects, axis=1)[:, j] * equations.error
         assert slope == pytest.approx(column, abs=0.02 * np.abs(column).max())  # an effect of first order: 1 % of it
+
+
+def test_a_candidate_at_its_optimum_has_the_uncertainty_of_the_fit_with_it() -> None:
+    unit = hand_held("stim300", 1, {"accelerometer.warm_up": None}, temperature=WARM)
+    sheet = unit.settings.sensor.accelerometer
+    noise, start = estimate_noise("accelerometer", unit.recordings, sheet), unit.calibrated("accelerometer")
+    model = model_of(unit.recordings, start, noise, unit.settings)
+    assert model is not None
+    selection = SelectionByHand(model, start, [], noise, sheet)
+    score = selection.first.scores["warm_up"]
+    fit = fit_configured(model, start, ["warm_up"], selection.hypotheses, selection.bounds)
+    assert score.uncertainty == pytest.approx(np.sqrt(np.diag(fit.covariance))[-len(score.values) :], rel=COMPARED_STEP)
