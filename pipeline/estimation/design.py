@@ -325,6 +325,11 @@ class Design:
         """Return the columns of one axis, the readings last: (n, q + 1) array."""
         return self.columns.columns[:, self._local[c]]
 
+    def left(self, step: Values) -> Values:
+        """Return what a step of the parameters, (p,), leaves of the readings: (n, 3) array."""
+        of_axes = ((self.of_axis(c), self.places(c)[1][:-1]) for c in range(3))
+        return np.stack([columns[:, -1] - columns[:, :-1] @ step[places] for columns, places in of_axes], axis=1)
+
     def places(self, c: int) -> tuple[Index, Index]:
         """Return the indices of the columns of one axis in A, and their parameters; the readings last."""
         return self._local[c], self._total[c][: len(self._local[c])]

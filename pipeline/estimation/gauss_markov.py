@@ -237,6 +237,17 @@ class Blocks:
         """Return the blocks in the order of time on each clock."""
         return np.lexsort((self.start, self.clock))
 
+    @cached_property
+    def _models(self) -> dict[tuple[Setting, ...], GaussMarkov]:
+        """The results of ``model``."""
+        return {}
+
+    def model(self, settings: tuple[Setting, ...]) -> GaussMarkov:
+        """Return C of the blocks at some settings; it is factorised once."""
+        if settings not in self._models:
+            self._models[settings] = GaussMarkov(self, settings)
+        return self._models[settings]
+
     def label(self, rows: int) -> Index:
         """Return the block of each of n rows: (n,) array."""
         return np.repeat(np.arange(len(self.first)), np.diff(np.append(self.first, rows)))
@@ -385,7 +396,7 @@ class Products:
         products, logarithm = np.repeat(self.white[None], len(settings), axis=0), np.zeros(len(settings))
         wander = [g for g, setting in enumerate(settings) if setting.ratio > 0.0]
         if wander:
-            model = GaussMarkov(self.blocks, [settings[g] for g in wander])
+            model = self.blocks.model(tuple(settings[g] for g in wander))
             # The difference comes first: in another order, rounding exceeds the remainder of collinear columns.
             within = self.white - self.means.T @ (self.blocks.weight[:, None] * self.means)
             products[wander] = within + model.products(self.means)
@@ -398,7 +409,7 @@ class Products:
 
     def bias(self, setting: Setting) -> Values:
         """Return ``E[bias | columns]`` of each row: (n, p) array."""
-        solved = GaussMarkov(self.blocks, [setting]).solve(self.means)[0]
+        solved = self.blocks.model((setting,)).solve(self.means)[0]
         return np.asarray((self.means - solved / self.blocks.weight[:, None])[self.blocks.label(len(self.weight))])
 
 

@@ -90,7 +90,6 @@ class JointFit(Start):
     rounds: int
     converged: bool
     condition: float  # of the scaled products of columns
-    cosine: float  # largest between the residual and a column, both whitened
     rank: int  # parameters, or combinations of them, that the readings determine
 
     @cached_property
@@ -136,14 +135,14 @@ def fit_terms(observations: Observations, terms: Terms, start: Start, settings: 
         small = SMALL_STEP_UNCERTAINTIES * np.sqrt(np.diag(solved.best_covariance))
         small[BASE] = np.maximum(small[BASE], 1e-12)
         converged = linear or bool(np.all(np.abs(taken) <= small))
-        if not linear:
+        if not converged:
             design = design_at(observations, state)
             solved = _solve(design, observations, settings)
-    residual, _ = _residual(observations, state)
+    residual = design.left(solved.step * converged)  # a step so small changes the columns by nothing that counts
     noise = observations.less_stop_errors
     squares = np.sum(noise.weight[:, None] * residual**2) + np.sum(noise.scatter)
     covariance, freedom = solved.posterior.averaged()
-    found = JointFit(
+    return JointFit(
         state.bias,
         state.K,
         state.scale,
@@ -156,12 +155,8 @@ def fit_terms(observations: Observations, terms: Terms, start: Start, settings: 
         rounds=rounds,
         converged=converged,
         condition=solved.condition,
-        cosine=solved.cosine_after if linear else solved.cosine,
         rank=solved.rank,
     )
-    if not linear:
-        found._designs[observations] = design  # of the last round  # noqa: SLF001
-    return found
 
 
 def _with_all_columns(start: Start, terms: Terms) -> Start:
@@ -207,9 +202,7 @@ class _SolvedStep:
     log_likelihood: float
     setting: Setting
     condition: float
-    # largest between a whitened column and the whitened residual, before the step and after a linear step
-    cosine: float
-    cosine_after: float
+    cosine: float  # largest between a whitened column and the whitened residual, before the step
     rank: int
     # each (g,); of every setting: log det C + log det(X^T C^-1 X), and the weighted sum of squared residuals
     logarithms: Values
@@ -245,7 +238,6 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
         setting=settings[best],
         condition=float(np.sqrt(values[best, -1] / max(values[best, 0], 1e-300))),
         cosine=float(np.max(np.abs(rhs[best]) / norm)),
-        cosine_after=float(np.max(np.abs(rhs[best] - gram[best] @ steps[best]) / norm)),
         rank=int(kept[best].sum()),
         logarithms=logarithms + determinants,
         squares=rss,
@@ -398,12 +390,13 @@ def calibration_of(
         stages=(*(before.stages if before else ()), stage),
         effects=effects,
         converged=fit.converged,
-        convergence=Convergence(fit.cosine, fit.condition, fit.rank, len(covariance)),
     )
     if settings is None:
         return combined(found, [scatter_contribution(covariance, fit.degrees_of_freedom)], {})
     names = [term.effect.name for term in fit.terms]
     design = fit.design(observations)
+    cosine = _solve(design, observations, [fit.setting]).cosine
+    found = replace(found, convergence=Convergence(cosine, fit.condition, fit.rank, len(covariance)))
     first = design.linear_map(fit.setting)
     prior = wander_prior(noise, settings.sensor.of(sensor))
     whole = replace(first, derivative=tuple(change @ J for J in first.derivative))

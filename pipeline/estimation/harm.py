@@ -131,10 +131,7 @@ def _harmful_in_turns(selection: Selection, fits: Sequence[JointFit]) -> dict[st
         for k, rest in enumerate(folds):
             products = design.reweighted(rest).products([each.setting])[0]
             step = projection(products, np.arange(products.shape[1] - 1))[0][:, -1]
-            for c in range(3):
-                columns, places = design.of_axis(c), design.places(c)[1]
-                left = columns[:, -1] - columns[:, :-1] @ step[places[:-1]]
-                errors += np.where(of_fold == k, (left / each.scale[c]) ** 2, 0.0)
+            errors += np.where(of_fold == k, np.sum((design.left(step) / each.scale) ** 2, axis=1), 0.0)
         squares.append(np.bincount(label, weight * errors, len(used))[used > 0.0] / used[used > 0.0])
     return harmful(names, squares, "in stretches of turns that the fit leaves out")
 

@@ -91,6 +91,12 @@ class Observations:
         kept = None if self.kept is None else self.kept()
         return compute() if kept is None else kept.once((self, key), compute)
 
+    def forget(self) -> None:
+        """Release the results that were computed ``once`` from observations of this sensor."""
+        kept = Quantities() if self.kept is None else self.kept() or Quantities()
+        for key in [key for key in kept if getattr(key[0], "sensor", None) == self.sensor]:
+            del kept[key]
+
     @cached_property
     def reading(self) -> Values:
         """All readings: (n, 3) array."""

@@ -133,8 +133,10 @@ class Selection:
             if self._other_delay():
                 self._forward()
                 self._fit_selected()
-        # without the designs of other fits, which would be kept as long as the unit
+        # without the designs of other fits and the motions of their rounds, which would be kept as long as the unit
         self.fits = {names: fit if fit is self.fit else replace(fit) for names, fit in self.fits.items()}
+        for part in self.observations.parts:
+            part.moved.clear()
 
     def without(self, names: Collection[str]) -> Selection | None:
         """Return the selection by the other candidates; None where their 2 log L is less by ``MIN_DELTA_BIC``."""

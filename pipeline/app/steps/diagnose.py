@@ -19,6 +19,7 @@ from pipeline.core.records import (
 )
 from pipeline.estimation.known_effects import without_known_effects
 from pipeline.estimation.noise import required_noises
+from pipeline.estimation.observations import observe
 from pipeline.evaluation.diagnosis.diagnose import diagnose, effective_noise, without_diagnosis
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)
     )
     other = next(c for s, c in known.items() if s != sensor)
     densities = effective_noise(calibration, filtered, noise, settings.table, found, other=other)
+    observe(sensor, filtered, settings.table).forget()  # no later step uses its selections
     return replace(found, further={**found.further, "effective_noise": densities})
 
 

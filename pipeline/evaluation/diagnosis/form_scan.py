@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from pipeline.core.records import Index, Mask, Values
 from pipeline.estimation.design import joined_motions, true_motion
-from pipeline.estimation.gauss_markov import WHITE_SETTING, GaussMarkov, Setting
+from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
 from pipeline.estimation.observations import Observations
 from pipeline.estimation.ranking import MIN_LEFT_SQUARE_SHARE, MIN_NEW_COLUMN_SHARE, UNIT_COLUMN_RIDGE
 from pipeline.estimation.selection import Selection
@@ -79,7 +79,7 @@ class Scan:
         self.blocks, self.weight = observations.blocks, observations.weight
         self._label = self.blocks.label(len(self.weight))
         self.settings = WHITE_SETTING, *selection.settings
-        self.noise = GaussMarkov(self.blocks, self.settings)
+        self.noise = self.blocks.model(self.settings)
         self._unit = float(UNIT_ROUNDOFF * np.sqrt(observations.samples)) ** 0.5
         # its columns depend on no weight
         self.design = design = selection.fit.design(observations)
@@ -119,7 +119,7 @@ class Scan:
         """Return the scan under some of its noise settings."""
         found, at = copy(self), [0, *(1 + self.settings[1:].index(setting) for setting in few)]
         found.settings = tuple(self.settings[k] for k in at)
-        found.noise = GaussMarkov(self.blocks, found.settings)
+        found.noise = self.blocks.model(found.settings)
         found.every = Whitened(self.every.inside, self.every.means[at])
         found._fit(self._among[at])  # noqa: SLF001
         return found
@@ -142,7 +142,7 @@ class Scan:
         for observations in resamples:
             found, factor = copy(self), observations.weight / self.weight
             found.observations, found.blocks = observations, observations.blocks
-            found.noise = GaussMarkov(found.blocks, self.settings)
+            found.noise = found.blocks.model(self.settings)
             of_rows = (weight * factor[first])[:, None]
             of_blocks = np.add.reduceat(of_rows * means, at) / found.blocks.weight[:, None]
             between = np.sqrt(of_rows) * (means - np.repeat(of_blocks, np.diff(np.append(at, len(first))), axis=0))

@@ -49,7 +49,7 @@ from pipeline.core.files import JSON
 from pipeline.core.records import BASE_COUNT, Dependence, Index, Motion, Noise, Values
 from pipeline.estimation.design import EffectColumns, placed
 from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
-from pipeline.estimation.gauss_markov import WHITE_SETTING, Blocks, GaussMarkov, Products, Setting, selection_grid
+from pipeline.estimation.gauss_markov import WHITE_SETTING, Blocks, Products, Setting, selection_grid
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.multi_position.fit import solve
 from pipeline.estimation.ranking import projection
@@ -215,7 +215,7 @@ def _draws(selection: Selection, scan: Scan, curves: Whitened) -> Iterator[tuple
     rotated = (np.sqrt(np.maximum(squares, 0.0)) * directions).T[-free:] * size if free else columns[:0]
     rest = 0.5 * (free - len(rotated))
     rotated = np.concatenate([rotated, np.zeros((1, len(size)))])
-    drawn.every, noise = Whitened(rotated[:, :p], scan.every.means), GaussMarkov(scan.blocks, [selection.fit.setting])
+    drawn.every, noise = Whitened(rotated[:, :p], scan.every.means), scan.blocks.model((selection.fit.setting,))
     for scale in scan.scale:
         white = rng.standard_normal((len(rotated), SIMULATIONS))
         white[-1] = np.sqrt(2.0 * rng.standard_gamma(rest, SIMULATIONS))

@@ -29,7 +29,6 @@ from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Design, EffectColumns, placed
 from pipeline.estimation.gates import MIN_DELTA_BIC, min_delta_bic
-from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import JointFit, calibration_of
 from pipeline.estimation.harm import fits_of, harmful_in_turns, harmful_on_held_out
 from pipeline.estimation.observability import alike_with_zeros, hidden_in, never_shown, not_observable, one_way
@@ -46,7 +45,7 @@ from pipeline.evaluation.diagnosis.verdict import verdict_of_selection
 from pipeline.evaluation.diagnosis.words import FAR_OFF, plain
 from pipeline.evaluation.held_out.error_breakdown import errors_of
 from pipeline.evaluation.held_out.samples import HeldOutCase
-from pipeline.evaluation.held_out.validation import noise_floors
+from pipeline.evaluation.held_out.validation import noise_floor, vector_noise_floor
 from pipeline.physics.effects import catalogue
 
 MOST_OF = 0.5  # share of the gain that the listed seconds have together
@@ -108,10 +107,10 @@ def _shares_of_blocks(
     others = np.setdiff1d(np.arange(design.count), index)
     change[others] = -(projection(products[:, :-1, :-1], others)[0] @ change)
     blocks, weight = observations.blocks, observations.weight
-    label, noise, gains = blocks.label(len(weight)), GaussMarkov(blocks, [fit.setting]), np.zeros(len(blocks.first))
+    label, noise, gains = blocks.label(len(weight)), blocks.model((fit.setting,)), np.zeros(len(blocks.first))
+    with_effect, without_it = design.left(-change), design.left(0.0 * change)
     for c in range(3):
-        columns, places = design.of_axis(c), design.places(c)[1]
-        both = np.stack([columns[:, -1] + columns[:, :-1] @ change[places[:-1]], columns[:, -1]], axis=1)
+        both = np.stack([with_effect[:, c], without_it[:, c]], axis=1)
         means = blocks.sums(weight[:, None] * both) / blocks.weight[:, None]
         inside = np.sum(weight[:, None] * (both - means[label]) ** 2 * [1.0, -1.0], axis=1)
         white = noise.whitened(means)[0] ** 2
@@ -338,13 +337,13 @@ def _held_out(
     calibrations = [calibration_of(fit, selection.observations, None) for fit in fits]
     before = case.calibration if last_fit(case.calibration).reference else calibrations[0]
     errors, time = errors_of([before, *calibrations], samples)
-    floor, vector_floor = noise_floors(calibrations[-1], samples)
+    floor = None if errors[0].shape[1] == 1 else vector_noise_floor(calibrations[-1], samples)
     setting, wander = fits[-1].setting, fits[-1].setting.ratio * fits[-1].scale
     if np.mean(wander**2) > np.mean(noise.wander**2):
         noise = replace(noise, wander=wander, correlation_time=setting.time)
     return (
         [float(np.sqrt(np.einsum("ij,ij", error, error) / len(error))) for error in errors[1:]],
-        floor if vector_floor is None or errors[0].shape[1] == 1 else vector_floor,
+        noise_floor(calibrations[-1], samples) if floor is None else floor,
         harmful_on_held_out(selection.names, [errors[0], *errors[2:]], time, noise),
     )
 

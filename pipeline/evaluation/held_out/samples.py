@@ -50,6 +50,7 @@ OFF_AXIS_SHARE = 0.03  # of the rate about one axis; cross-axis sensitivity of d
 NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(48)  # enough for the 0.4 % of a simulation (test_norm_error)
 THETA, STEP = np.pi / 4.0 * (NODES + 1.0), np.pi / 4.0 * NODE_WEIGHTS
 LINEAR_FROM = 30.0  # standard deviations from zero, beyond which the norm is linear to 1e-3
+AT_ONCE = 10_000  # samples near zero whose quadratures are computed together: 10 MB an array
 REPRESENTATIVE_SAMPLES = 2000  # samples that represent a recording: its directions and rates change slowly
 
 
@@ -340,7 +341,8 @@ def mean_squares(truth: Values, S: Values) -> tuple[Values, Values]:
     squares, g = along.copy(), np.zeros(len(truth))
     near = (size <= LINEAR_FROM * np.sqrt(total)) & (total > 0.0)
     if near.any():
-        squares[near] = _near_zero(truth[near], size[near], S)
+        pieces = np.array_split(np.flatnonzero(near), 1 + np.count_nonzero(near) // AT_ONCE)
+        squares[near] = np.concatenate([_near_zero(truth[at], size[at], S) for at in pieces])
         g[near] = np.clip((squares - along)[near] / np.maximum(total - along[near], 1e-12 * total), 0.0, 1.0)
     return squares, g
 

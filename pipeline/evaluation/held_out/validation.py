@@ -152,7 +152,7 @@ def validate(
     )
     if count:
         steps, notes = breakdown.error_breakdown(calibration, samples)
-        floor, vector_floor = noise_floors(calibration, samples)
+        floor, vector_floor = noise_floor(calibration, samples), vector_noise_floor(calibration, samples)
         part = replace(
             part,
             noise_floor=floor,
@@ -311,15 +311,19 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
     return Agreement(p_value, AXES[worst // 3], AXES[worst % 3], float(error[worst]), 2.0 * float(u[worst]))
 
 
-def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
-    """Return the rms error by noise alone, and the vector rms error by noise alone where an attitude is known."""
+def noise_floor(calibration: SensorCalibration, samples: Sequence[Samples]) -> float:
+    """Return the rms error by noise alone."""
     known = [(reference_vector(calibration, s)[s.known], s.variance[s.known]) for s in samples]
     squares = [squared_norm_errors(truth, calibration.matrix, variance) for truth, variance in known]
-    floor = float(np.sqrt(np.mean(np.concatenate(squares))))
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
+
+
+def vector_noise_floor(calibration: SensorCalibration, samples: Sequence[Samples]) -> float | None:
+    """Return the vector rms error by noise alone where an attitude is known."""
     if not all(breakdown.direction_known(calibration, s) for s in samples):
-        return floor, None
+        return None
     vectors = np.concatenate([(s.variance @ np.sum(calibration.matrix**2, axis=0))[s.known] for s in samples])
-    return floor, float(np.sqrt(np.mean(vectors)))
+    return float(np.sqrt(np.mean(vectors)))
 
 
 def _why_not_held_out(case: HeldOutCase) -> str:
