@@ -187,7 +187,7 @@ def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]
     w, *v = _between(alone[:, chosen[:-1]], alone[:, chosen[1:]])
     sine = np.maximum(np.linalg.norm(v, axis=0), np.finfo(float).tiny)
     angles = np.degrees(2.0 * np.arctan2(np.copysign(sine, w), np.abs(w)))
-    rates = (angles / sine * v / intervals).T
+    rates = (angles / sine * v / intervals).T.astype(np.float32, order="C")  # the filter computes in single precision
     off = dict.fromkeys(("gyroscope_range", "acceleration_rejection", "magnetic_rejection", "rejection_timeout"), 0.0)
     frequency, NWU = float(1.0 / np.median(intervals)), imufusion.CONVENTION_NWU
     settings = imufusion.AhrsSettings(sample_rate=frequency, convention=NWU, gain=FILTER_GAIN, **off)
@@ -196,12 +196,13 @@ def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]
     set_period, update, attitude = fusion.set_sample_period, fusion.update_no_magnetometer, fusion.get_quaternion
     # The filter compares the force with the attitude before its step.
     period = 0.0
-    for interval, rate, reading in zip(intervals.astype(np.float32).tolist(), rates, force[chosen[:-1]], strict=True):
-        if interval != period:  # the filter computes in single precision
+    periods, forces = intervals.astype(np.float32).tolist(), force[chosen[:-1]].astype(np.float32)
+    for interval, rate, reading in zip(periods, rates, forces, strict=True):
+        if interval != period:
             set_period(period := interval)
         update(rate, reading)
         q.append(attitude())
-    return chosen, np.array(q, float)
+    return chosen, np.concatenate(q).reshape(-1, 4).astype(float)
 
 
 def _with_reference(recording: Recording) -> tuple[Recording, Values]:

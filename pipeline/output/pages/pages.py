@@ -139,7 +139,7 @@ def typeset(sentence: str) -> str:
     """Return a sentence or a unit of the terminal with typographic signs: ``±``, ``−``, ``ΔBIC``, ``°C``."""
     for ascii_text, sign in TYPOGRAPHIC.items():
         sentence = sentence.replace(ascii_text, sign)
-    return re.sub(r"(?<![\w.-])-(?=\d)|(?<=\de)-(?=\d)", MINUS, sentence)
+    return re.sub(r"-(?=\d)(?:(?<![\w.-]-)|(?<=\de-))", MINUS, sentence)  # searched by its first letter: fast
 
 
 def unit_text(unit: object) -> str:
