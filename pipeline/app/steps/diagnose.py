@@ -17,6 +17,7 @@ from pipeline.core.records import (
     Validation,
     calibrated,
 )
+from pipeline.estimation.candidates import MOUNTING
 from pipeline.estimation.known_effects import without_known_effects
 from pipeline.estimation.noise import required_noises
 from pipeline.estimation.observations import observe
@@ -106,7 +107,8 @@ def _diagnosed(  # noqa: PLR0917  (what a diagnosis needs)
     )
     other = next(c for s, c in known.items() if s != sensor)
     densities = effective_noise(calibration, filtered, noise, settings.table, found, other=other)
-    observe(sensor, filtered, settings.table).forget()  # no later step uses its selections
+    if MOUNTING not in found.configured:  # else the gyroscope's mountings use the accelerometer's selections
+        observe(sensor, filtered, settings.table).forget()
     return replace(found, further={**found.further, "effective_noise": densities})
 
 
