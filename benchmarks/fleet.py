@@ -177,7 +177,9 @@ def _report(folder: Path, cores: int) -> list[MeasuredFigure]:
     milliseconds = _range([1000 * floor for floor in floors])
     print(f"floor: {1000 * least:.1f} ms a unit, median of {len(floors)} measurements of {milliseconds} ms")
     print(f"ratio to the floor: {used / units / least:.1f}")
+    stages = sorted(spent, key=lambda name: -spent[name])
     return [
+        *(MeasuredFigure(f"of {name}", 1000.0 * spent[name] / units, units, unit="ms") for name in stages),
         MeasuredFigure(f"CPU a unit, {units} units", 1000.0 * used / units, units, unit="ms"),
         MeasuredFigure(f"... over the floor, {units} units", used / units / least, units, "<= 22", unit="times"),
         MeasuredFigure(f"largest process, {units} units", memory[largest], units, unit="MB"),
