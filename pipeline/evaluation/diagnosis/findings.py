@@ -155,7 +155,7 @@ def with_unknown(found: SensorDiagnosis) -> SensorDiagnosis:
 
     Answers compare sets of the catalogue, which the verdict says are no explanation. Of effects that they gave 0.9 or
     more, 77 of 94 were there in sensors with effects of the catalogue alone, and none of 687 in those with others
-    (``all_families``, fdedcedf): ``IMITATED`` of each answer goes to its quantities outside the catalogue alone, or to
+    (blind study, fdedcedf): ``IMITATED`` of each answer goes to its quantities outside the catalogue alone, or to
     the covariate of the residual, if it has none.
     """
     covariate = found.unexplained[0].covariate if found.unexplained else "time"
