@@ -11,7 +11,7 @@ from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.core.records import Motion, Recording, SensorCalibration, Values, standard_uncertainty
 from pipeline.core.settings import DataSheet, Settings, Table
 from pipeline.estimation.design import EffectColumns, NormalPrior, Terms, placed
-from pipeline.estimation.gates import TIMES_POSSIBLE, within
+from pipeline.estimation.gates import possible
 from pipeline.estimation.observations import Observations
 from pipeline.physics.effects import catalogue, effect, stated_priors
 from pipeline.physics.effects.base import Effect, parameter_limits
@@ -170,12 +170,12 @@ def estimates(terms: Terms, covariance: Values) -> dict[str, tuple[Values, Value
 
 
 def offered(names: Sequence[str], terms: Terms, covariance: Values, data_sheet: DataSheet, sensor: str) -> list[str]:
-    """Return the selected effects for ``auto``: none if one of them is not possible (beyond ``TIMES_POSSIBLE`` limits).
+    """Return the selected effects for ``auto``: none if one of them is not possible (``gates.possible``).
 
     ``terms``: of the fit, the last parameters of its ``covariance``.
     """
     limits, found = limits_of(sensor, data_sheet), estimates(terms, covariance)
-    every = all(within(*found[name], limits[name], TIMES_POSSIBLE) for name in names if name in limits)
+    every = all(possible(*found[name], limits[name]) for name in names if name in limits)
     return list(names) if every or data_sheet.accept_implausible else []
 
 

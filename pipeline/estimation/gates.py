@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from pipeline.core.records import Values
+from pipeline.core.records import Values, coverage_factor
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import Effect
 
@@ -67,3 +67,8 @@ def min_gain(this: Effect, sensor: str, parameters: int, equations: float, candi
 def within(values: Values, uncertainty: Values, limits: Values | float, times: float = 1.0) -> bool:
     """Return ``|p| - 2 u <= times L`` for every parameter p of an effect, with its limit L: (p,) arrays."""
     return bool(np.all(np.abs(values) - TIMES_UNCERTAINTY * uncertainty <= times * limits))
+
+
+def possible(values: Values, uncertainty: Values, limits: Values) -> bool:
+    """Return whether no parameter of an effect is beyond three times its limit, by its 95 % interval: (p,) arrays."""
+    return bool(np.all(np.abs(values) - float(coverage_factor(np.inf)) * uncertainty <= TIMES_POSSIBLE * limits))

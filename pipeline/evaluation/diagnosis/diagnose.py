@@ -52,7 +52,7 @@ from pipeline.core.settings import Effects, Settings, Table, Uncertainty
 from pipeline.core.verdicts import Verdict, decided_words
 from pipeline.estimation.candidates import AUTO, MOUNTING, TILT, configured_effects
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
-from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, TIMES_POSSIBLE, within
+from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, TIMES_POSSIBLE, possible
 from pipeline.estimation.noise import with_noises
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.stages import last_fit
@@ -132,7 +132,7 @@ def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
     values = np.array([p.value for p in entry.parameters.values()])
     u = np.array([p.standard_uncertainty or 0.0 for p in entry.parameters.values()])
     limits = parameter_limits(this, case.sensor, sheet.effects)
-    if len(limits) == len(values) and not sheet.accept_implausible and not within(values, u, limits, TIMES_POSSIBLE):
+    if len(limits) == len(values) and not sheet.accept_implausible and not possible(values, u, limits):
         ratio = float(np.max(np.abs(values) / limits))
         return f"it would be {ratio:.3g} times the data sheet's limit; at most {TIMES_POSSIBLE:g} times is possible"
     if entry.effect == EARTH and np.linalg.norm(values) > _longest_by_chance(EARTH_RATE_DPS, float(np.max(u))):

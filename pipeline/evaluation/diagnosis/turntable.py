@@ -108,9 +108,9 @@ def _shares_of_blocks(
     change[others] = -(projection(products[:, :-1, :-1], others)[0] @ change)
     blocks, weight = observations.blocks, observations.weight
     label, noise, gains = blocks.label(len(weight)), blocks.model((fit.setting,)), np.zeros(len(blocks.first))
-    with_effect, without_it = design.left(-change), design.left(0.0 * change)
+    with_effect = design.left(-change)
     for c in range(3):
-        both = np.stack([with_effect[:, c], without_it[:, c]], axis=1)
+        both = np.stack([with_effect[:, c], design.of_axis(c)[:, -1]], axis=1)
         means = blocks.sums(weight[:, None] * both) / blocks.weight[:, None]
         inside = np.sum(weight[:, None] * (both - means[label]) ** 2 * [1.0, -1.0], axis=1)
         white = noise.whitened(means)[0] ** 2
