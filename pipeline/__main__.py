@@ -71,7 +71,7 @@ def main(argv: list[str] | None = None) -> int:
 def run_command(words: list[str]) -> int:
     """Run a known command in this process."""
     from pipeline.core.errors import UNKNOWN_LAYOUT, PipelineError  # noqa: PLC0415
-    from pipeline.core.user_cache import use_cache  # noqa: PLC0415
+    from pipeline.core.files import use_cache  # noqa: PLC0415
 
     use_cache()
     command, *rest = words

@@ -36,11 +36,11 @@ class Step(NamedTuple):
 
 STEPS = {  # in the order of a run
     "ingest": Step("ingest.ingest", ("files",), (*BENCH_SECTIONS, "ingest"), "checked"),
-    "filter": Step("filter.filter_recordings", ("checked",), ("sensor", "filter"), "recordings"),
+    "filter": Step("ingest.filter_recordings", ("checked",), ("sensor", "filter"), "recordings"),
     # once for each stage of the method of each sensor; the stage ``effects`` reads the section ``effects``, too
     "fit": Step("fit.fit", ("recordings", "fits"), (*BENCH_SECTIONS, "method", "uncertainty"), "fits"),
     "validate": Step(
-        "validate.validate_unit", ("unit", "recordings", "fits"), (*BENCH_SECTIONS, "limits"), "validated"
+        "diagnose.validate_unit", ("unit", "recordings", "fits"), (*BENCH_SECTIONS, "limits"), "validated"
     ),
     "diagnose": Step(
         "diagnose.diagnose_unit",
@@ -54,7 +54,7 @@ STEPS = {  # in the order of a run
         (*BENCH_SECTIONS, "method", "ingest", "diagnosis", "stated"),
         "calibration",
     ),
-    "export": Step("export.export", DOCUMENTS, ("sensor", "table"), "exports"),
+    "export": Step("calibration.export", DOCUMENTS, ("sensor", "table"), "exports"),
     "report": Step(
         "report.report",
         ("recordings", *DOCUMENTS, "omissions"),

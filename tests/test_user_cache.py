@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import jinja2
 import pytest
 
-from pipeline.core import user_cache
+from pipeline.core import files as user_cache
 from pipeline.core.compiled_templates import CompiledTemplates
-from pipeline.core.user_cache import cache_folder, from_cache, to_cache
+from pipeline.core.files import cache_folder, from_cache, to_cache
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -22,7 +22,7 @@ from pipeline.core.verdicts import Verdict
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW
 from pipeline.output.pages.chart import Dots, Figure, LineMark, Panel, chart
 from pipeline.physics.effects import effect
-from pipeline.physics.effects.free_curves import OTHER_PREFIX
+from pipeline.physics.effects.equations import OTHER_PREFIX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

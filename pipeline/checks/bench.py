@@ -53,14 +53,13 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.core.errors import IngestError
-from pipeline.core.records import AXES, Recording, Values, cross
+from pipeline.core.records import AXES, Recording, Values, axis_matrix, cross
 from pipeline.core.settings import RecordingFile, Table
-from pipeline.ingest.axis_maps import (
+from pipeline.ingest.quality_flags import (
     FAILS_DEG,
     MAX_ROTATION_SAMPLES,
     MIN_MEDIAN_MOVES,
     MoveByHand,
-    axis_matrix,
     misfits_deg,
     moves_of,
 )

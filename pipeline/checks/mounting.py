@@ -34,9 +34,8 @@ from pipeline.checks.bench import (
 )
 from pipeline.checks.seats import TurnRecording, refined_zeros, seat_notes
 from pipeline.core.errors import IngestError
-from pipeline.core.records import AXES, Note, Recording, Values, level_in_body
+from pipeline.core.records import AXES, STRAIGHT, Note, Recording, Values, axis_maps, axis_matrix, level_in_body
 from pipeline.core.settings import Procedure, Sensor, Settings, Table
-from pipeline.ingest.axis_maps import STRAIGHT, axis_maps, axis_matrix
 from pipeline.physics.kinematics import UP_AT_ZERO
 
 TOLERANCE_DEG = 5.0  # default of procedure.mounting_tolerance_deg: beyond misalignments and seats of a careful bench

@@ -10,8 +10,7 @@ from typing import Any
 import jinja2
 from jinja2.bccache import Bucket
 
-from pipeline.core.files import state_of_files
-from pipeline.core.user_cache import from_cache, to_cache
+from pipeline.core.files import from_cache, state_of_files, to_cache
 
 
 class CompiledTemplates(jinja2.BytecodeCache):

@@ -15,7 +15,7 @@ from pipeline.estimation.gates import possible
 from pipeline.estimation.observations import Observations
 from pipeline.physics.effects import catalogue, effect, stated_priors
 from pipeline.physics.effects.base import Effect, parameter_limits
-from pipeline.physics.effects.free_curves import MAX_BEND_SHARE_OF_ROOM, Bend
+from pipeline.physics.effects.equations import MAX_BEND_SHARE_OF_ROOM, Bend
 from pipeline.physics.effects.mounting import SETUP_EFFECTS
 from pipeline.physics.signal.filters import MIN_SWING_DEGC, heats_and_cools
 

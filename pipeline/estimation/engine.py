@@ -1,4 +1,4 @@
-"""Compute the uncertainty of an estimate from the residuals of its fit.
+"""Compute the uncertainty of an estimate from the residuals of its fit, also by a Monte Carlo method.
 
 Every fit is linear in the readings near its solution, ``d beta = sum over channels c of J_c A_c dy_c`` (``LinearMap``).
 Under one hypothesis about the noise (``pipeline.estimation.gauss_markov``) the estimate has the covariance
@@ -24,6 +24,22 @@ Linear least squares ``x = argmin |y - A x|^2``: columns are scaled to unit norm
 factorised as ``A = Q U diag(s) V^T diag(d)``; the singular values s show which combinations the data determine. The
 certificate of a minimum is the largest cosine between the residual and a column of the Jacobian, which is zero at a
 minimum (Bates & Watts, Nonlinear Regression Analysis, 1988, section 2.2.3).
+
+``with_trials`` propagates distributions by a Monte Carlo method, in addition to the law of propagation (JCGM 101:2008):
+
+    parameters_r = f(z + e_r),    e_r = e_noise + sum over sources of type B e_s,    r = 1 .. M
+
+where
+
+    z       : linear functions of the readings that a fit computes first (coefficients of a sinusoid, response to the
+              rate, lengths of gravity at the rests, directions of moves); to draw these instead of readings is exact
+    f       : all further computation, without linearisation
+    e_noise : normal under each hypothesis of the noise; the hypotheses are drawn by their weight
+    e_s     : normal; also the sum of many rounding errors is normal
+
+The law of propagation is confirmed if both ends of its interval ``y +- U`` are within ``delta = 10^l / 2`` of the ends
+of the Monte Carlo interval, with ``u = c 10^l`` and c an integer of the stated digits (8.1): one digit below a million
+trials, else two, because the ends of a Monte Carlo interval scatter by 2.7 u / sqrt(M).
 """
 
 from __future__ import annotations
@@ -34,9 +50,21 @@ from functools import cache
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
 from pipeline.core.errors import NotObservableError
-from pipeline.core.records import Convergence, Index, Values, noise_of_steps
+from pipeline.core.records import (
+    AFTER_BASE,
+    BIAS,
+    MATRIX,
+    Contribution,
+    Convergence,
+    Index,
+    MonteCarlo,
+    SensorCalibration,
+    Values,
+    noise_of_steps,
+)
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting, WanderPrior
 
 ONE_SIGMA, COVERED = 0.6827, 0.95  # probabilities at which the mixture and Student's t agree
@@ -49,6 +77,14 @@ AVERAGED_OUT = 1e-3  # share of a column's size in block means, below which it d
 RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
 PART_OF_NULL_SPACE = 1e-3  # component of a unit vector of it, above which a parameter is named as not determined
 ROW_SUM_RIDGE = 1e-9  # 1e7 times the rounding of a double, for sums over many rows; 3e-5 of a standard deviation
+Draw = Callable[[np.random.Generator, int], Values]
+SEED = 101  # any number
+INTERVAL_COVERAGE = 0.95  # probability of an interval
+BATCH = 500  # trials drawn at a time, which bounds the memory
+TWO_DIGITS = 1_000_000  # trials
+NEWTONS = 6  # each squares the relative error of a step; one by a wide prior starts at some 0.5
+# of the largest singular value of unit columns, the root of 1e-13: the rounding of their products
+MIN_SINGULAR_VALUE_SHARE = 3e-7
 
 
 @dataclass(frozen=True)
@@ -453,3 +489,103 @@ def linear_convergence(A: Values, residual: Values, condition: float, rank: int)
     size = np.multiply.outer(np.linalg.norm(A, axis=0), np.linalg.norm(residual, axis=0))
     cosine = np.divide(products, size, out=np.zeros_like(products), where=size > 0.0)
     return Convergence(float(cosine.max()), condition, rank, A.shape[1])
+
+
+def numerical_tolerance(standard_uncertainty: ArrayLike, digits: int = 2) -> Values:
+    """Return delta for standard uncertainties that are stated to some significant digits: (n,) array (7.9.2)."""
+    u = np.atleast_1d(np.asarray(standard_uncertainty, float))
+    exponent = np.floor(np.log10(np.maximum(u, np.finfo(float).tiny))) - digits + 1.0
+    exponent += np.round(u / 10.0**exponent) >= 10.0**digits  # 0.0996 is 10 x 10^-2 to two digits
+    return np.asarray(0.5 * 10.0**exponent)
+
+
+def compared(results: ArrayLike, estimate: ArrayLike, expanded: ArrayLike, *, digits: int = 2) -> MonteCarlo:
+    """Compare ``y +- U`` of n parameters by the law of propagation with the 95 % interval of (M, n) drawn results.
+
+    The interval has as much probability below as above (7.7). A parameter without an uncertainty is confirmed.
+    """
+    values, y = np.sort(np.asarray(results, float), axis=0), np.atleast_1d(np.asarray(estimate, float))
+    U, u = np.atleast_1d(np.asarray(expanded, float)), values.std(axis=0, ddof=1)
+    M, known = len(values), U > 0.0
+    inside = round(INTERVAL_COVERAGE * M)
+    first = (M - inside) // 2
+    low, high = values[first], values[min(first + inside, M - 1)]
+    tolerance = numerical_tolerance(np.minimum(u, U), digits)
+    d_low, d_high = np.abs(y - U - low), np.abs(y + U - high)
+    validated = ((d_low <= tolerance) & (d_high <= tolerance)) | ~known
+    mean, tolerance = values.mean(axis=0), np.where(known, tolerance, 0.0)
+    return MonteCarlo(M, SEED, digits, y, U, mean, u, low, high, tolerance, d_low, d_high, validated)
+
+
+def through(posterior: ErrorMixture, stated: Sequence[Values], results: Callable[[Values], Values]) -> Draw:
+    """Return a function that draws parameters.
+
+    ``posterior``: of the noise of q linear functions of the readings. ``stated``: (q, q), covariances by stated
+    accuracies. ``results``: errors (t, q) to parameters (t, p).
+    """
+
+    def draw(rng: np.random.Generator, count: int) -> Values:
+        errors = posterior.draw(rng, count)
+        for covariance in stated:
+            errors += draw_normal(rng, covariance, count)
+        return results(errors)
+
+    return draw
+
+
+def with_trials(
+    calibration: SensorCalibration, draw: Draw, trials: int, direct: Sequence[Contribution] = ()
+) -> SensorCalibration:
+    """Return a calibration whose budget also has the Monte Carlo run and its comparison.
+
+    ``calibration``: with its budget. ``draw``: generator and t to (t, p) parameters. ``trials``: M. ``direct``: sources
+    of type B that act on the parameters themselves.
+    """
+    rng, drawn = np.random.default_rng(SEED), []
+    for start in range(0, trials, BATCH):
+        values = draw(rng, min(BATCH, trials - start))
+        for source in direct:
+            values = values + draw_normal(rng, source.covariance, len(values))
+        drawn.append(values)
+    assert calibration.budget is not None  # noqa: S101  (see above)
+    parameters, digits = calibration.parameters, 2 if trials >= TWO_DIGITS else 1
+    run = compared(np.concatenate(drawn), parameters.values, parameters.expanded_uncertainty, digits=digits)
+    return replace(calibration, budget=replace(calibration.budget, monte_carlo=run))
+
+
+def quadratic_results(columns: Values, curvature: Values, inverse: Values) -> Callable[[Values], Values]:
+    """Return the step of a least-squares fit as a function of the equations' errors, to second order of the model.
+
+        g(d) = J^T W (X d + d^T H d / 2 - e) = 0,   J = X + H d
+
+    ``columns``: (n, p), X. ``curvature``: (n, p, p), H, symmetric in its last two. ``inverse``: (n, n), W, the weights
+    of the fit. The function takes (t, n) errors e and returns (t, p) steps d, by Gauss-Newton with the J of each draw:
+    if a prior is wide, H d is as large as X.
+    """
+    w, V = np.linalg.eigh(inverse)
+    root = (V * np.sqrt(np.maximum(w, 0.0))).T
+    size = np.linalg.norm(root @ columns, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    X = root @ columns / size
+    n, p = X.shape
+    flat = (np.einsum("mn,npq->mpq", root, curvature) / np.outer(size, size)).reshape(n * p, p)
+
+    def step(e: Values) -> Values:
+        white = e @ root.T
+        d = white @ np.linalg.pinv(X, rcond=MIN_SINGULAR_VALUE_SHARE).T
+        for _ in range(NEWTONS):
+            bent = (d @ flat.T).reshape(len(d), n, p)
+            J = X + bent
+            gradient = np.einsum("tnp,tn->tp", J, d @ X.T + 0.5 * np.einsum("tnp,tp->tn", bent, d) - white)
+            normal = np.linalg.pinv(J.transpose(0, 2, 1) @ J, rcond=MIN_SINGULAR_VALUE_SHARE**2, hermitian=True)
+            d = d - np.einsum("tpq,tq->tp", normal, gradient)
+        return np.asarray(d / size)
+
+    return step
+
+
+def with_matrix(values: Values) -> Values:
+    """Return (t, 12 + p) parameters with the matrix instead of K."""
+    K = values[:, MATRIX].reshape(-1, 3, 3)
+    matrix = np.linalg.solve(K, np.broadcast_to(np.eye(3), K.shape)).reshape(-1, 9)
+    return np.concatenate([values[:, BIAS], matrix, values[:, AFTER_BASE]], axis=1)

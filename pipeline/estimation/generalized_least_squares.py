@@ -54,9 +54,14 @@ from pipeline.estimation.design import (
     stepped,
     without_unknown_motion,
 )
-from pipeline.estimation.engine import MIN_EIGENVALUE_SHARE, ErrorMixture, ResidualNoise, noise_outside_known_errors
+from pipeline.estimation.engine import (
+    MIN_EIGENVALUE_SHARE,
+    ErrorMixture,
+    ResidualNoise,
+    noise_outside_known_errors,
+    with_matrix,
+)
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, selection_grid
-from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.observations import Observations, observe, weighted
 from pipeline.estimation.table_errors import Reference, disturbance

@@ -49,7 +49,7 @@ from pipeline.estimation.ranking import MIN_NEW_COLUMN_SHARE, without
 from pipeline.estimation.selection import DELAYS, Selection
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.base import Effect
-from pipeline.physics.effects.free_curves import BEND, free_curves
+from pipeline.physics.effects.equations import BEND, free_curves
 
 INCLUSION = 0.02  # prior probability of each effect
 FIRST_VERSION_AND_SCALE = 0, 3  # version and scale at which the search for the best ones of a set begins

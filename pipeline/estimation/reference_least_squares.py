@@ -32,9 +32,8 @@ import numpy as np
 from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.core.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageResult, Values
 from pipeline.estimation.candidates import bench_effects
-from pipeline.estimation.engine import LinearMap, ScaledColumns, linear_convergence
+from pipeline.estimation.engine import LinearMap, ScaledColumns, linear_convergence, with_matrix
 from pipeline.estimation.generalized_least_squares import fit_joint
-from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.stages import FitStage, StageInput, details_on_table
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import TurnPart, parts_of, rows_of_parts, settled

@@ -16,8 +16,8 @@ from pipeline.estimation.engine import ResidualNoise, ScaledColumns
 from pipeline.estimation.gauss_markov import Blocks, WanderPrior
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.physics.effects.base import length
-from pipeline.physics.encoder_trajectory import Pieces
 from pipeline.physics.kinematics import table_motion
+from pipeline.physics.signal.encoder_rate import Pieces
 from pipeline.physics.signal.rests import RATE_AT_REST_DPS, runs
 
 FIT_BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings

@@ -71,9 +71,8 @@ from pipeline.core.records import (
 from pipeline.core.settings import DataSheet, Settings, Table
 from pipeline.estimation.candidates import TILT, limits_of, tilt_like_zeros
 from pipeline.estimation.design import EffectColumns, Terms, columns_of_samples, joined_motions
-from pipeline.estimation.engine import LinearMap, ResidualNoise, scaled_inverse
+from pipeline.estimation.engine import LinearMap, ResidualNoise, scaled_inverse, through, with_trials
 from pipeline.estimation.gauss_markov import WanderPrior
-from pipeline.estimation.monte_carlo import through, with_trials
 from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
 from pipeline.estimation.multi_position.fit import FitByHand
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel

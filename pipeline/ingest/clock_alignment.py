@@ -1,4 +1,4 @@
-"""Align the clock of a table's log with the sensor's clock, by the motion in both logs.
+"""Align the log or the program of a table with the clock of a sensor, by the motion in the readings, and merge them.
 
     tau  = t + d + k (t - t_m)
     w(t) = A r(tau) + a + noise,   f(t) = B u(tau) + b + noise
@@ -20,7 +20,7 @@ with the projected derivatives J and the residuals e, enlarged for the effective
 blocks of 1 s and of 4 s. The uncertainty is the largest of both and that of white noise, combined with the error of the
 interpolation, 0.5 % of the table's interval.
 
-Interpolate the log of a table's encoders that has a separate clock, and merge it with the log of a sensor.
+The log of the encoders is interpolated to the times of the readings:
 
     rate r and angle A of the turn     the gyroscope responds to r, the accelerometer to (cos A, sin A)
     attitude q                         the gyroscope responds to omega, the accelerometer to R(q)^T e_z
@@ -28,11 +28,22 @@ Interpolate the log of a table's encoders that has a separate clock, and merge i
 Between two samples the angle is the cubic through angle and rate at both ends, exact for constant acceleration. The
 rate is linear, with one bend where the slopes on both sides require it. The attitude is the quintic spline of its
 components.
+
+``follow_program``: a table without encoders has its commanded program alone,
+
+    A(t) = P(tau),   r(t) = P'(tau),   tau = m_j + (1 + k) (t - t_j) + d_j       near move j
+
+with the commanded angle P, deg, at the program's time tau. The middle m_j of move j is at the sensor's time t_j by
+offset and drift of the whole program (``pipeline.ingest.clock_alignment``); d_j is the deviation of the move from that,
+s. The drift k during moves is separate, because pauses between moves would bias it.
+
+``d_j`` and ``k`` are fitted to the readings w = a P'(tau) + b of the gyroscope near the move, so that pauses between
+moves may have any length. Lost steps of the motors are not observable; they are part of the table's accuracy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,7 +51,8 @@ import numpy as np
 from imu_logs.log import Log, Note
 from imu_logs.units import ATTITUDE, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError
-from pipeline.core.records import Mask, Values, conjugate_product, continuous, level_in_body
+from pipeline.core.records import Index, Mask, Values, conjugate_product, continuous, level_in_body
+from pipeline.core.settings import ProgramRest, ProgramTurn, Repeated
 
 ENCODER_STEP_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
 MOST_POINTS = 1 << 18  # bounds memory and the cost of correlation; a power of 2 for the transform
@@ -58,6 +70,10 @@ MIN_SHARED_DURATION = 0.5  # share of the shorter log that both must cover
 MAX_CLOCK_STEPS, ROUNDING_S = 20, 1e-9  # Gauss-Newton stops below 1 ns, the resolution of the times
 MIN_CLOCK_BLOCKS = 3.0  # bounds the factor nu / (nu - 2), the variance of Student's t, for few blocks
 RESOLVED = 0.005  # of the table's interval: between its samples the motion is interpolated
+PROGRAM_STEP_S = 0.005  # grid of the program and of its derivative, half the interval of a log at 100 Hz
+BEFORE_S = 1.0  # rest that is added at both ends
+MAX_FIT_ITERATIONS = 12  # iterations at most; they end where no move changes by 1 us
+MAX_SHARE_OF_REST = 0.5  # of the rest before or after a move
 
 
 @dataclass(frozen=True)
@@ -448,3 +464,125 @@ def _merged(sensor: Log, log: Log, rows: slice, tau: Values, clock: dict[str, fl
         values=sensor_channels | {channel: at(tau) for channel, at in found.items()},
         source=sensor.source | ({"table_clock": clock} if clock else {}) | joined,
     )
+
+
+def follow_program(table: Log, program: Sequence[ProgramRest | ProgramTurn | Repeated]) -> Log:
+    """Add the angle and rate of a table with this program to a log; the gyroscope must show the moves."""
+    pause = ProgramRest(rest_s=BEFORE_S)
+    commanded = Program([pause, *_flat(program), pause])
+    times = np.arange(0.0, commanded.duration, PROGRAM_STEP_S)
+    angle, rate, *_ = commanded.at(times)
+    log = {"table_angle": angle, "table_rate": rate}
+    fit = fit_clocks(table, Log(table.path, np.rint(times * 1e9).astype(np.int64), log, table.source))
+    t = seconds_of(table)
+    tau, shifts, drift, begun = _place(table, commanded, t, fit.table_time(t))
+    angle, rate, *_ = commanded.at(tau)
+    begun, farthest = round(begun, 3) + 0.0, float(np.abs(shifts).max())
+    detail = (
+        f"the table is followed from its program: {len(shifts)} move{'s'[: len(shifts) > 1]}, begun {begun:.3f} "
+        f"s after the first sample by a clock that gains {drift * 1e6:.3g} ppm, each placed by the gyroscope "
+        f"(up to {farthest:.2g} s off the program; correlation {fit.correlation:.5f}); angles and rates are those "
+        "commanded"
+    )
+    note = Note("N-PROGRAM", len(shifts), 0, 0, detail, float(table.time_ns[0]) / 1e9, float(table.time_ns[-1]) / 1e9)
+    values = {**table.values, "table_angle": angle, "table_rate": rate}
+    source = {**table.source, "program": [step.json_value for step in program]}
+    return replace(table, values=values, notes=(*table.notes, note), source=source)
+
+
+class Program:
+    """Commanded motion of one axis of a table: rests, and turns with a trapezoidal rate.
+
+        A(t) = A_k + W_k s + a_k s^2 / 2,   dA/dt = W_k + a_k s,   s = t - t_k
+
+    A turn by the angle D at the rate r with acceleration a ramps for r/a, holds r and ramps down; where |D| < r^2/a it
+    does not reach r, and the ramps meet in the middle. The table rests before and after the program.
+
+    ``knots``: (1 + 4 n, 4) array of time t_k
+    (s), angle A_k (deg), rate W_k (deg/s) and acceleration a_k (deg/s^2), four rows for each of n moves. ``stops``:
+    (n + 1,) array of the angles before each move and after the last, deg. ``duration``: in s.
+    """
+
+    def __init__(self, steps: Iterable[ProgramRest | ProgramTurn]) -> None:
+        self.steps = list(steps)
+        time, angle, rows = 0.0, 0.0, [(0.0, 0.0, 0.0, 0.0)]
+        for step in self.steps:
+            if isinstance(step, ProgramRest):
+                time += step.rest_s
+                continue
+            turn = step.turn_deg
+            if turn == 0.0:
+                continue
+            acceleration, sign = step.acceleration_dps2, float(np.sign(turn))
+            top = min(step.rate_dps, float(np.sqrt(abs(turn) * acceleration)))
+            ramp, hold = top / acceleration, abs(turn) / top - top / acceleration
+            half = sign * 0.5 * top * ramp
+            rows += [
+                (time, angle, 0.0, sign * acceleration),
+                (time + ramp, angle + half, sign * top, 0.0),
+                (time + ramp + hold, angle + turn - half, sign * top, -sign * acceleration),
+                (time + 2 * ramp + hold, angle + turn, 0.0, 0.0),
+            ]
+            time, angle = time + 2 * ramp + hold, angle + turn
+        self.knots, self.duration = np.array(rows), time
+        self.stops: Values = self.knots[::4, 1]
+
+    def at(self, time: Values) -> tuple[Values, Values, Values, Index]:
+        """Return angle, rate, acceleration and index of the present or last move (-1: before the first), (n,) each."""
+        k = np.clip(np.searchsorted(self.knots[:, 0], time, side="right") - 1, 0, None)
+        s = np.clip(time - self.knots[k, 0], 0.0, None)
+        _, angle, rate, acceleration = self.knots[k].T
+        return angle + (rate + 0.5 * acceleration * s) * s, rate + acceleration * s, acceleration, (k - 1) // 4
+
+
+def _flat(program: Sequence[ProgramRest | ProgramTurn | Repeated]) -> Iterator[ProgramRest | ProgramTurn]:
+    """Yield the steps of a program, with repetitions expanded."""
+    for step in program:
+        if isinstance(step, Repeated):
+            yield from step.repeat * step.steps
+        else:
+            yield step
+
+
+def _place(table: Log, program: Program, t: Values, tau: Values) -> tuple[Values, Values, float, float]:
+    """Fit the time of each move to the readings of the gyroscope near it.
+
+    Returns the program's time at the sensor's times, s; the deviation of each move, s; the drift; and the sensor's time
+    at which the program began, s. ``tau`` is the program's time from offset and drift alone.
+    """
+    begin, end = program.knots[1::4, 0], program.knots[4::4, 0]
+    gaps = begin[1:] - end[:-1]
+    middle, n = (begin + end) / 2, len(begin)
+    near = np.searchsorted(end[:-1] + gaps / 2, tau)  # the nearest move of each sample
+    low, high = np.append(-np.inf, end[:-1])[near], np.append(begin[1:], np.inf)[near]  # between its neighbours
+    at = np.interp(middle, tau, t)
+    since = t - at[near]
+    reach = MAX_SHARE_OF_REST * np.minimum(np.append(np.inf, gaps), np.append(gaps, np.inf))
+    reach = np.minimum(reach, end - begin + 1.0)
+    shifts, drift = np.zeros(n), 0.0
+    for _ in range(MAX_FIT_ITERATIONS):
+        now = np.clip(middle[near] + (1.0 + drift) * since + shifts[near], low, high)
+        commanded = program.at(now)[1]
+        sensed = _about_the_moves(table, commanded)
+        slope = (program.at(now + PROGRAM_STEP_S)[1] - program.at(now - PROGRAM_STEP_S)[1]) / (2 * PROGRAM_STEP_S)
+        off = slope * (sensed - commanded)
+        info = np.bincount(near, slope**2, n)
+        change = np.divide(np.bincount(near, off, n), info, out=np.zeros(n), where=info > 0)
+        lever = since - np.divide(np.bincount(near, slope**2 * since, n), info, out=np.zeros(n), where=info > 0)[near]
+        drift += float(np.sum(off * lever)) / max(float(np.sum((slope * lever) ** 2)), 1e-300)
+        shifts = np.clip(shifts + change, -reach, reach)
+        if float(np.abs(change).max()) < 1e-6:
+            break
+    begun = float(at[0]) - (float(middle[0] + shifts[0]) - BEFORE_S) / (1.0 + drift)
+    return np.clip(middle[near] + (1.0 + drift) * since + shifts[near], low, high), shifts, drift, begun
+
+
+def _about_the_moves(table: Log, commanded: Values) -> Values:
+    """Return the rate about the axis of the moves by the gyroscope, corrected for scale and bias: (n,) array, deg/s."""
+    rates = np.column_stack([table.values[c] for c in TRIADS["gyroscope"]])
+    columns = np.column_stack([commanded, np.ones_like(commanded)])
+    fitted = np.linalg.lstsq(columns, rates, rcond=None)[0]
+    axis = int(np.argmax(np.abs(fitted[0])))
+    scale, bias = fitted[:, axis]
+    about: Values = (rates[:, axis] - bias) / scale
+    return about

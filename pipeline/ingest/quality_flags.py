@@ -8,11 +8,21 @@ A reading is *stuck* where it is constant for longer than noise allows. The shar
 of 64 samples measures the noise of the channel. A run of ``L`` equal values among ``n`` is expected ``n p^(L-1)`` times
 by chance, and flagged if that is below 10^-6. If the 95th percentile of ``p`` exceeds one half, the noise is below the
 resolution, and no run is flagged.
+
+The unit of the angular rates follows from the rotation of gravity between rests. In the sensor's axes,
+
+    du/dt = -(s w) x u
+
+with the direction u of the specific force, measured at rest before and after a move; the reading w of the gyroscope,
+minus its mean in these rests; and the unknown s, deg/s per unit of the gyroscope. With the right s, the integral from u
+before the move gives u after it. With any other possible unit (57.3 times, or another range of the sensor) the error is
+tens of degrees.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import itertools
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,10 +30,10 @@ import numpy as np
 from imu_logs.clocks import bursts_error, rounded_error
 from imu_logs.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TABLE_CHANNELS, TRIADS
 from pipeline.core.errors import IngestError
-from pipeline.core.records import SENSOR_UNITS, Index, Integers, Mask, Note, Recording, median
+from pipeline.core.records import SENSOR_UNITS, Index, Integers, Mask, Note, Recording, Values, median
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -57,6 +67,20 @@ _OTHER_FACTORS = {
     1e-3: "times of a unit a thousand times shorter", 1e3: "times of a unit a thousand times longer",
     1e-6: "times of a unit a million times shorter", 1e6: "times of a unit a million times longer", 1e-9: "ns",
 }  # fmt: skip
+ROTATION_BLOCK_S = 0.25  # two blocks make the shortest rest, half a second
+MIN_VARIANCE_SAMPLES = 5  # samples, for a variance
+STILL_VARIANCE_RATIO = 9.0  # times the 10th percentile of the variance
+MIN_RELATIVE_VARIANCE = 1e-7  # relative to the square of the specific force
+LARGEST_DRIFT_DEG = 2.0  # between any two parts of a rest; more is slow motion
+LARGEST_STEP_DEG = 0.5  # from block to block of a rest; a turn at 2 deg/s
+BLOCK_NOISE = 5.0  # standard deviations between the means of two blocks; in 10^5 blocks noise exceeds it less than once
+ROTATION_BINS = 64  # a half turn rotates by less than 3 deg in each
+LONGEST_MOVE_S = 30.0  # a bias of 0.5 deg/s then adds 15 deg, the limit FITS_DEG
+SMALLEST_TURN_DEG = 20.0  # above FITS_DEG, so that a prediction without rotation does not fit
+MIN_MEDIAN_MOVES = 3  # for a median
+MOST_MOVES = 40  # bounds the cost
+MAX_ROTATION_SAMPLES = 200_000  # bounds the cost
+FITS_DEG, FAILS_DEG = 15.0, 30.0  # the error of any other possible unit is tens of degrees
 
 
 def flag_gaps(table: Log, flags: NDArray[np.uint16], checks: Checks) -> list[Note]:
@@ -372,8 +396,6 @@ def _check_turn_rate(table: Log) -> None:
         ratio = float(median(size / rate[turning]))
         seen = f"while the table turns the angular rate is {ratio:.3g} times the table's"
     else:
-        from pipeline.ingest.axis_maps import declared_scale  # noqa: PLC0415  (imported where there is no table)
-
         found = declared_scale(table)
         if found is None:
             return
@@ -382,3 +404,114 @@ def _check_turn_rate(table: Log) -> None:
         if 0.7 < ratio / factor < 1.4:
             hint = "correct ingest.csv.columns.gyro_x.unit (gyro_y, gyro_z)"
             raise IngestError(f"{seen}: the numbers look like {what}", table.path, code="implausible_rate", hint=hint)
+
+
+@dataclass(frozen=True)
+class MoveByHand:
+    """A move between two rests."""
+
+    turns: Values  # integral of the angular rate over parts of the move, (64, 3), unit of the gyroscope times s
+    before: Values  # direction of the specific force at rest
+    after: Values
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle of gravity's rotation in the sensor's axes, deg."""
+        return float(np.degrees(np.arccos(np.clip(self.before @ self.after, -1.0, 1.0))))
+
+    @property
+    def way(self) -> float:
+        """Total angle of the move by the gyroscope, in its unit times s."""
+        return float(np.linalg.norm(self.turns, axis=1).sum())
+
+
+def interval_of(steps: Values) -> float:
+    """Return the usual interval from the steps of time; the mean step forward where most times are written twice."""
+    middle = float(np.median(steps))
+    return middle if middle > 0 else float(np.mean(np.maximum(steps, 0.0)))
+
+
+def rests_of(force: Values, interval_s: float) -> list[tuple[int, int]]:
+    """Return start and stop of stretches of at least half a second at rest, from (n, 3) forces in any unit."""
+    width = max(MIN_VARIANCE_SAMPLES, round(ROTATION_BLOCK_S / interval_s))
+    count = len(force) // width
+    if count < 4:
+        return []
+    blocks = force[: count * width].reshape(count, width, 3)
+    means = blocks.mean(axis=1)
+    scatter = blocks.var(axis=1).sum(axis=1)
+    size = float(np.median(np.linalg.norm(means, axis=1)))
+    still = scatter < max(STILL_VARIANCE_RATIO * float(np.quantile(scatter, 0.1)), MIN_RELATIVE_VARIANCE * size**2)
+    noise = BLOCK_NOISE * float(np.sqrt(2.0 * np.quantile(scatter, 0.1) / width))
+    slow = np.linalg.norm(np.diff(means, axis=0), axis=1) <= max(np.radians(LARGEST_STEP_DEG) * size, noise)
+    still &= np.append(slow, False) | np.append(False, slow)
+    edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=0, append=0))
+    found = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
+    drift = max(np.radians(LARGEST_DRIFT_DEG) * size, noise)
+    return [(a * width, b * width) for a, b in found if np.linalg.norm(means[a:b] - means[a], axis=1).max() <= drift]
+
+
+def moves_of(force: Values, rate: Values, time_s: Values) -> list[MoveByHand]:
+    """Return the moves between rests in which gravity rotated by more than 20 degrees; (n, 3) readings in any unit."""
+    steps = np.diff(time_s, append=2 * time_s[-1] - time_s[-2])
+    rests = rests_of(force, interval_of(steps))
+    found: list[MoveByHand] = []
+    for (a, b), (c, d) in itertools.pairwise(rests):
+        if len(found) == MOST_MOVES or time_s[c] - time_s[b - 1] > LONGEST_MOVE_S:
+            continue
+        ends = [force[a:b].mean(axis=0), force[c:d].mean(axis=0)]
+        before, after = (e / np.linalg.norm(e) for e in ends)
+        start = max(a, b - 1)
+        bias = (rate[a:b].mean(axis=0) + rate[c:d].mean(axis=0)) / 2
+        turned = (rate[start : c + 1] - bias) * steps[start : c + 1, None]
+        edges = np.linspace(0, len(turned), ROTATION_BINS + 1).astype(int)
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(turned, axis=0)])
+        move = MoveByHand(np.diff(sums[edges], axis=0), before, after)
+        if move.angle_deg > SMALLEST_TURN_DEG:
+            found.append(move)
+    return found
+
+
+def misfit_deg(moves: Sequence[MoveByHand], scales: Sequence[float]) -> Values:
+    """Return the median over moves of ``misfits_deg``: (len(scales),) array, deg."""
+    return np.asarray(np.median(misfits_deg(moves, scales), axis=0))
+
+
+def misfits_deg(moves: Sequence[MoveByHand], scales: Sequence[float]) -> Values:
+    """Return the angle between predicted and measured gravity after each move, for each scale: (moves, scales) array.
+
+    ``scales``: candidates of ``s``, deg/s per unit of the gyroscope.
+    """
+    factors = np.radians(np.asarray(scales, float))[None, :, None]
+    direction = np.repeat(np.stack([m.before for m in moves])[:, None, :], len(scales), axis=1)
+    for part in np.stack([m.turns for m in moves], axis=1):
+        vector = -part[:, None, :] * factors
+        angle = np.linalg.norm(vector, axis=2, keepdims=True)
+        axis = vector / np.maximum(angle, 1e-12)
+        along = np.sum(axis * direction, axis=2, keepdims=True)
+        direction = (
+            direction * np.cos(angle) + np.cross(axis, direction) * np.sin(angle) + axis * along * (1 - np.cos(angle))
+        )
+    after = np.stack([m.after for m in moves])[:, None, :]
+    return np.asarray(np.degrees(np.arccos(np.clip(np.sum(direction * after, axis=2), -1.0, 1.0))))
+
+
+def declared_scale(table: Log) -> tuple[float, str] | None:
+    """Return the factor by which the angular rates are wrong, and the evidence; None if they are right or undecided."""
+    if not {"accel_x", "gyro_x"} <= table.values.keys():
+        return None
+    part = slice(0, MAX_ROTATION_SAMPLES)
+    force, rate = (np.column_stack([table.values[c][part] for c in TRIADS[s]]) for s in ("accelerometer", "gyroscope"))
+    time_s = (table.time_ns[part] - table.time_ns[0]) / 1e9
+    moves = moves_of(force, rate, time_s)
+    if len(moves) < MIN_MEDIAN_MOVES:
+        return None
+    scales = (1.0, DEGREES, 1 / DEGREES)
+    misfits = misfit_deg(moves, scales)
+    best = int(np.argmin(misfits))
+    if misfits[0] < FAILS_DEG or misfits[best] > FITS_DEG:
+        return None
+    return 1 / scales[best], (
+        f"in {len(moves)} moves between rests gravity turns by the angle of the rates if they are multiplied by "
+        f"{scales[best]:.4g} ({misfits[best]:.1f} deg error, {misfits[0]:.0f} deg as declared)"
+    )

@@ -36,21 +36,24 @@ from pipeline.core.records import (
     BETWEEN_ATTITUDES_S,
     NOISE_OF_ROWS,
     SENSORS,
+    STRAIGHT,
     Integers,
     Mask,
     Note,
     Recording,
     Values,
+    axis_maps,
+    axis_matrix,
     files_of_readings,
+    in_body_axes,
+    map_of_orientation,
     rate_of_attitude,
 )
 from pipeline.core.settings import Ingest, Procedure, RecordingFile, Sensor
-from pipeline.ingest.axis_maps import STRAIGHT, axis_maps, axis_matrix, in_body_axes, map_of_orientation
 from pipeline.ingest.clock_alignment import unwrapped
 from pipeline.ingest.disturbances import leave_out_disturbances, leave_out_shaken_rests
-from pipeline.ingest.files import candidate_files
+from pipeline.ingest.files import candidate_files, require_recordings
 from pipeline.ingest.quality_flags import examine, without_gaps
-from pipeline.ingest.recordings_sheet import require_recordings
 
 MAX_NAMED_FILES = 5  # further files that an error lists
 LEAST_TURN_OF_ROWS = 0.01  # rad: rows of attitudes differ by more, samples of a rest or of movement by less
@@ -208,7 +211,7 @@ def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | N
     ``entry``: of the procedure, with the ``program`` of a table without a log. ``sensor``: None if it is not known.
     """
     if entry.program and not set(TABLE_CHANNELS) & table.values.keys():
-        from pipeline.ingest.commanded_motion import follow_program  # noqa: PLC0415  (few tables need it)
+        from pipeline.ingest.clock_alignment import follow_program  # noqa: PLC0415  (few tables need it)
 
         table = follow_program(table, entry.program)
     table = unwrapped(table)

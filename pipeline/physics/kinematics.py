@@ -40,8 +40,7 @@ from pipeline.core.records import (
     quintic_spline,
 )
 from pipeline.core.settings import Table
-from pipeline.physics.encoder_trajectory import EncoderTrajectory, Pieces
-from pipeline.physics.signal.encoder_rate import rate_by_angle
+from pipeline.physics.signal.encoder_rate import EncoderTrajectory, Pieces, rate_by_angle
 from pipeline.physics.signal.filters import temperature_of, temperature_rate_of
 from pipeline.physics.signal.rests import still_samples
 

@@ -45,7 +45,7 @@ from pipeline.core.errors import ConfigurationError, MissingInputError
 from pipeline.core.files import CONFIGS
 from pipeline.core.records import AXES, Values
 from pipeline.core.settings import SECTIONS, Settings, completed
-from pipeline.ingest.commanded_motion import Program
+from pipeline.ingest.clock_alignment import Program
 from pipeline.ingest.files import wrong_name
 from pipeline.simulation import REST_BY_HAND_S
 from pipeline.simulation.trajectory import (

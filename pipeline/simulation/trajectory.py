@@ -43,7 +43,7 @@ import scipy
 
 from pipeline.core.records import Index, Values, attitude_matrix
 from pipeline.core.settings import ProgramRest, ProgramTurn
-from pipeline.ingest.commanded_motion import Program
+from pipeline.ingest.clock_alignment import Program
 from pipeline.physics.kinematics import level_at_zero, turn_by_vector
 
 ProgramStep: TypeAlias = ProgramRest | ProgramTurn

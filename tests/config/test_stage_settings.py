@@ -113,7 +113,7 @@ def test_a_change_of_sheet_or_device_concerns_the_batch_of_the_unit(tmp_path: Pa
 
 @pytest.mark.parametrize("stage", ["validate", "diagnose", "calibration", "export", "report"])
 def test_the_digest_of_a_stage_contains_the_files_of_the_built_in_effects(stage: str) -> None:
-    read = {file.name for file in stage_settings._closure(f"pipeline.app.steps.{stage}")}
+    read = {file.name for file in stage_settings._closure(f"pipeline.app.steps.{MODULES[stage]}")}
     assert {f"{name}.yaml" for name in built_in()} <= read
 
 

@@ -19,7 +19,7 @@ DOCUMENTED = {
 }
 SAME = (
     "pipeline.simulation.trajectory", "pipeline.simulation.description", "pipeline.estimation.uncertainty_budget",
-    "pipeline.estimation.monte_carlo",
+    "pipeline.estimation.engine",
 )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ TAKE_JSON = {
     ),
     "documents of a run: written, read, and shown on pages, by commands and in formats of other programs": (
         "app/commands/explain.py", "app/commands/noise.py", "evaluation/diagnosis/words.py", "output/exports/",
-        "app/field_logs/stream.py", "output/history.py", "ingest/arrow.py", "ingest/axis_maps.py", "app/one_unit.py",
+        "app/field_logs/stream.py", "output/history.py", "ingest/arrow.py", "app/one_unit.py",
         "ingest/files.py",
         "physics/compensation.py", "physics/statements.py",
         "output/outcome.py", "app/planning/plan.py", "core/records/",

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.records import coverage_factor
-from pipeline.estimation.engine import derivative
-from pipeline.estimation.monte_carlo import compared, numerical_tolerance
+from pipeline.estimation.engine import compared, derivative, numerical_tolerance
 from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from tests.estimation.complex_step import solve_linear
 

@@ -13,9 +13,8 @@ from unit_settings import settings_of, with_noise
 from pipeline.core.records import LIMIT, Budget, SensorCalibration
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.engine import ErrorMixture
+from pipeline.estimation.engine import ErrorMixture, quadratic_results, through, with_trials
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
 from pipeline.estimation.stages import StageInput
 from pipeline.output.pages.pages import monte_carlo_of
 from pipeline.simulation.campaign import simulate_unit

@@ -24,7 +24,7 @@ from pipeline.estimation.evidence import (
 )
 from pipeline.estimation.posterior import ODDS, UPPER_LIMIT_SHARE, Answers, SetSearch, answers, quantiles
 from pipeline.estimation.ranking import without
-from pipeline.physics.effects.free_curves import BEND, free_curves
+from pipeline.physics.effects.equations import BEND, free_curves
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

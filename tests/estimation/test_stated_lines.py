@@ -13,7 +13,7 @@ from table_turns import Bench, settings
 from unit_settings import settings_of, with_noise
 
 from pipeline.app.steps import batch
-from pipeline.app.steps.filter import filter_recordings
+from pipeline.app.steps.ingest import filter_recordings
 from pipeline.app.steps.unit_files import FILES
 from pipeline.checks.reference_scale import rate_error
 from pipeline.core.records import Coefficient, FittedEffect, Noise, Note, UnitRecordings

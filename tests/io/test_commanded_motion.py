@@ -11,7 +11,7 @@ from simulated_logs import as_table
 
 from pipeline.core.errors import IngestError
 from pipeline.core.records import Recording
-from pipeline.ingest.commanded_motion import Program, follow_program
+from pipeline.ingest.clock_alignment import Program, follow_program
 from pipeline.simulation.campaign import Streams, as_program
 from pipeline.simulation.description import Course, plan
 from pipeline.simulation.trajectory import CommandedTurns, rest, turn

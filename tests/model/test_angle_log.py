@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.records import Motion, Recording
-from pipeline.ingest.commanded_motion import Program
+from pipeline.ingest.clock_alignment import Program
 from pipeline.physics.kinematics import reference_motion
 from pipeline.simulation.trajectory import rest, turn, turn_with_plateau
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.ingest.commanded_motion import Program
-from pipeline.physics.encoder_trajectory import EncoderTrajectory, nearest_slope
+from pipeline.ingest.clock_alignment import Program
+from pipeline.physics.signal.encoder_rate import EncoderTrajectory, nearest_slope
 from pipeline.simulation.trajectory import rest, turn_with_plateau
 
 

@@ -11,7 +11,7 @@ import yaml
 
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.records import rate_of_attitude
-from pipeline.ingest.commanded_motion import Program, _flat
+from pipeline.ingest.clock_alignment import Program, _flat
 from pipeline.simulation.campaign import Streams, as_program, simulate_unit, write_campaign
 from pipeline.simulation.description import Course, UnitDescription, description_from, plan
 from pipeline.simulation.trajectory import CommandedTurns

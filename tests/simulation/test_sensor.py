@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.ingest.commanded_motion import Program
+from pipeline.ingest.clock_alignment import Program
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.base import Owner, truth
 from pipeline.physics.effects.formula_effect import FormulaEffect

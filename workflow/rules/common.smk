@@ -30,7 +30,7 @@ from pipeline.app.results_folder import finish_publishing, repetitions, replaced
 from pipeline.app.run_progress import Monitor
 from pipeline.app.steps.batch import forget_last_outputs
 from pipeline.app.steps.job_server import COMMAND, start_server
-from pipeline.core.user_cache import use_cache
+from pipeline.core.files import use_cache
 
 use_cache()
 RUNNING = not workflow.is_main_process

@@ -14,7 +14,7 @@ rule export:
         mem_mb=1000,
         runtime=10,
     params:
-        code=code_digest("pipeline.app.steps.export"),
+        code=code_digest("pipeline.app.steps.calibration"),
     shell:
         "{RUN} export --config {input.settings:q} --code {params.code} --calibration {input.calibration:q} --validate {input.validate:q}"
         " --diagnose {input.diagnose:q} --output {output:q} > {log:q} 2>&1"

@@ -12,6 +12,6 @@ rule filter:
         mem_mb=1000,
         runtime=10,
     params:
-        code=code_digest("pipeline.app.steps.filter"),
+        code=code_digest("pipeline.app.steps.ingest"),
     shell:
         "{RUN} filter --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --output {output:q} > {log:q} 2>&1"

@@ -43,7 +43,7 @@ from pipeline.app.config.options import (
     with_references,
 )
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.files import CONFIGS, state_of_files
+from pipeline.core.files import CONFIGS, from_cache, state_of_files, to_cache
 from pipeline.core.settings import (
     OF_BENCH,
     SECTIONS,
@@ -59,10 +59,8 @@ from pipeline.core.settings import (
     range_settings,
     without_overridden,
 )
-from pipeline.core.user_cache import from_cache, to_cache
 from pipeline.estimation.stages import NOT_WANTED, check_stages, declared
-from pipeline.ingest.files import candidate_files
-from pipeline.ingest.recordings_sheet import with_sheet
+from pipeline.ingest.files import candidate_files, with_sheet
 
 Groups: TypeAlias = tuple[tuple[str, str], ...]  # group and option
 INSTANCE = "${ingest.instance}"

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from imu_logs.units import SENSORS
 from pipeline.app.config.options import GIVEN, effects_for
-from pipeline.core.files import EFFECTS_FOLDER, canonical_json, state_of_files
+from pipeline.core.files import EFFECTS_FOLDER, canonical_json, from_cache, state_of_files, to_cache
 from pipeline.core.settings import OF_BENCH, Board, Settings, Stated, Unit
-from pipeline.core.user_cache import from_cache, to_cache
 from pipeline.ingest.files import state_of_recordings
 from pipeline.output.history import digest
 from pipeline.unit import EFFECTS_STAGE, STEPS

@@ -22,8 +22,7 @@ import numpy as np
 
 from imu_logs.mcap_write import VECTORS
 from pipeline.core.errors import PipelineError
-from pipeline.core.records import SENSORS
-from pipeline.ingest.axis_maps import axis_matrix, maps_of_log
+from pipeline.core.records import SENSORS, axis_matrix, maps_of_log
 from pipeline.physics.compensation import SMOOTHING_S, load, read_calibration
 from pipeline.physics.measurement import ExponentialRegression
 

@@ -45,9 +45,8 @@ from imu_logs.text_write import text_scalar, times_as_decimals, to_arrow, to_num
 from imu_logs.units import ACCELEROMETER, CANONICAL, COUNTS, GYROSCOPE, SECOND_NS, SINCE_1970_NS, TRIADS, UNITS
 from pipeline.app.field_logs.log_checks import DECIMALS, LogChecks
 from pipeline.core.errors import ConfigurationError, InputError, MissingInputError, PipelineError
-from pipeline.core.records import SENSORS, Integers, Recording, Values
+from pipeline.core.records import SENSORS, STRAIGHT, Integers, Recording, Values, axis_matrix, in_body_axes, maps_of_log
 from pipeline.core.settings import Ingest
-from pipeline.ingest.axis_maps import STRAIGHT, axis_matrix, in_body_axes, maps_of_log
 from pipeline.physics.compensation import SMOOTHING_S, Compensation
 from pipeline.physics.signal.rests import find_rests
 

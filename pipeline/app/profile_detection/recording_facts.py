@@ -45,9 +45,20 @@ from pipeline.core.errors import IngestError, shortened
 from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Note, Recording, median
 from pipeline.core.settings import Ingest, RecordingFile, Sensor, Settings
 from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
-from pipeline.ingest.axis_maps import FAILS_DEG, FITS_DEG, MoveByHand, misfit_deg, moves_of, rests_of
 from pipeline.ingest.files import FILE, grouped, parts_of
-from pipeline.ingest.quality_flags import CLIPPED, GAP, REST_LIMITS, STUCK, equal_share
+from pipeline.ingest.quality_flags import (
+    CLIPPED,
+    FAILS_DEG,
+    FITS_DEG,
+    GAP,
+    REST_LIMITS,
+    STUCK,
+    MoveByHand,
+    equal_share,
+    misfit_deg,
+    moves_of,
+    rests_of,
+)
 from pipeline.ingest.read import read_attitudes, read_table, to_recording, turn_between_rows
 from pipeline.physics.signal.rests import SHORTEST_REST_S, Rest, find_rests, rests_from_table, runs
 from pipeline.physics.signal.segments import MAX_AXIS_SINE, turns_by_hand

@@ -33,7 +33,7 @@ from imu_logs.guesses import (
 from imu_logs.units import COUNTS, DEGREES, FORCE_UNITS, UNITS
 from imu_logs.yaml_file import read_yaml
 from pipeline.core.files import CONFIGS
-from pipeline.ingest.axis_maps import MoveByHand, interval_of, misfit_deg, moves_of, rests_of
+from pipeline.ingest.quality_flags import MoveByHand, interval_of, misfit_deg, moves_of, rests_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -1,11 +1,10 @@
-"""Step calibration: compose the published calibration of a unit.
+"""Steps calibration and export: compose the published calibration of a unit, and write it for other programs.
 
 A sensor whose fit has a significantly larger held-out error than the raw readings is null in it, with the reason. A
 unit without any calibrated sensor has failed.
 
-Compute the uncertainty of the body frame of a calibration against the case of the unit.
-
-Turn axes, faces and zeros define the frame in which bias, matrix and U hold. About each axis of the body
+Turn axes, faces and zeros define the frame in which bias, matrix and U hold. Its uncertainty against the case of the
+unit, about each axis of the body, is
 
     on a table  U^2 = k^2 (s^2 / m + l^2),    s^2 = max(s_stated^2, sum_j (r_j - r)^2 / (m - 1))
     by faces    U^2 = k^2 / (4 / s_f^2 + 2 / s_a^2)
@@ -40,14 +39,16 @@ from pipeline.core.records import (
     SensorCalibration,
     Validation,
     Values,
+    axis_maps,
     calibrated,
     coverage_factor,
 )
+from pipeline.core.settings import Settings
 from pipeline.estimation.candidates import MOUNTING
 from pipeline.estimation.chips import Chip, chip_document
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.ingest.axis_maps import axis_maps
 from pipeline.ingest.quality_flags import GAP
+from pipeline.output.exports import exports
 from pipeline.physics.statements import beyond_limits, implausible, not_determined, with_open
 
 if TYPE_CHECKING:
@@ -273,3 +274,10 @@ def inputs(recordings: Sequence[Recording]) -> list[dict[str, Any]]:
         }
         for r in recordings
     ]
+
+
+def export(
+    calibration: dict[str, Any], validation: dict[str, Any], diagnosis: dict[str, Any], settings: Settings
+) -> dict[str, str]:
+    """Return the files of ``exports/<unit>/`` by name."""
+    return exports(calibration, settings, validation, diagnosis)

@@ -1,7 +1,8 @@
-"""Step diagnose: find the effects that the model of each sensor lacks."""
+"""Steps validate and diagnose: compute the errors on held-out motion, and find the effects that the models lack."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,15 +14,20 @@ from pipeline.core.records import (
     Noise,
     SensorCalibration,
     SensorDiagnosis,
+    SensorValidation,
     UnitRecordings,
     Validation,
     calibrated,
 )
+from pipeline.core.settings import Settings
 from pipeline.estimation.candidates import MOUNTING
 from pipeline.estimation.known_effects import without_known_effects
 from pipeline.estimation.noise import required_noises
 from pipeline.estimation.observations import observe
 from pipeline.evaluation.diagnosis.diagnose import diagnose, effective_noise, without_diagnosis
+from pipeline.evaluation.held_out.attitude import attitude, gravity_direction, held_out_turns
+from pipeline.evaluation.held_out.samples import OTHER_SENSOR
+from pipeline.evaluation.held_out.validation import validate
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,6 +35,31 @@ if TYPE_CHECKING:
     from pipeline.app.steps.batch import Job
     from pipeline.core.pack import Files
     from pipeline.core.settings import Settings
+
+
+def validate_unit(unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings) -> Validation:
+    """Return the errors on held-out motion after each step of both fits."""
+    filtered, found = recordings.filtered, calibrated(fits)
+    noise = recordings.noises.get("gyroscope")
+    return Validation(
+        unit,
+        held_out_errors(recordings, fits, settings),
+        attitude(found["accelerometer"], found["gyroscope"], filtered),
+        gravity_direction(**found, recordings=filtered, noise=noise, procedure=settings.procedure),
+        *held_out_turns(**found, recordings=filtered, noise=noise, procedure=settings.procedure),
+    )
+
+
+def held_out_errors(
+    recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings
+) -> dict[str, SensorValidation | None]:
+    """Return the errors of each sensor; None for a sensor without a calibration."""
+    known = calibrated(fits)
+    noises = required_noises(recordings, settings.sensor, known)
+    return {
+        s: None if c is None else validate(c, recordings.filtered, noises[s], settings, other=known[OTHER_SENSOR[s]])
+        for s, c in known.items()
+    }
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Steps collect and ingest: read, cut and check the recordings of a unit."""
+"""Steps collect, ingest and filter: read, cut, check and filter the recordings of a unit; estimate their noise."""
 
 from __future__ import annotations
 
@@ -13,8 +13,12 @@ from pipeline.checks.checks import check_recordings
 from pipeline.checks.evidence import gravity_turned, of_table, spin
 from pipeline.core.errors import IngestError, PipelineError, failure_of
 from pipeline.core.pack import FAILED_SUFFIX, Pack, as_bytes, new_pack
+from pipeline.core.records import Recording, UnitRecordings
+from pipeline.core.settings import Settings
+from pipeline.estimation.noise import with_noises
 from pipeline.ingest.files import candidate_files, recording_files, state_of_recordings
 from pipeline.ingest.read import read_recordings
+from pipeline.physics.signal.filters import apply_filter
 from pipeline.physics.signal.segments import cut, held_out_windows, logged_turns
 
 if TYPE_CHECKING:
@@ -127,3 +131,11 @@ def _named(source: Mapping[str, Any], name: Callable[[str], str]) -> dict[str, A
         return dict(source)
     joined = {"joined": [_named(other, name) for other in source["joined"]]} if "joined" in source else {}
     return {**source, "file": name(source["file"]), **joined}
+
+
+def filter_recordings(checked: list[Recording], settings: Settings) -> UnitRecordings:
+    """Filter the recordings of a unit, and estimate the noise of each sensor."""
+    filtered = checked
+    if settings.filter.name != "none":
+        filtered = [apply_filter(recording, settings.filter) for recording in checked]
+    return with_noises(filtered, settings.sensor)

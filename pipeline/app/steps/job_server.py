@@ -88,7 +88,7 @@ def _prepare() -> None:
     ):
         import_module(module)  # stages import them inside functions
 
-    from pipeline.core.user_cache import use_cache  # noqa: PLC0415
+    from pipeline.core.files import use_cache  # noqa: PLC0415
     from pipeline.evaluation.diagnosis import words  # noqa: PLC0415
     from pipeline.output.exports import formats  # noqa: PLC0415
     from pipeline.output.pages.pages import compile_templates  # noqa: PLC0415

@@ -7,9 +7,9 @@ from functools import lru_cache
 from typing import Any
 
 from pipeline.app.steps.batch import Job, record_output
+from pipeline.app.steps.diagnose import held_out_errors
 from pipeline.app.steps.summary import failed_files
 from pipeline.app.steps.unit_files import StoredUnit
-from pipeline.app.steps.validate import held_out_errors
 from pipeline.core.errors import DamagedFileError
 from pipeline.core.pack import DOCUMENT_FOLDERS, STAGE_OF, Files, Pack, as_bytes, new_pack
 from pipeline.core.records import SENSORS, Validation, fit_from_json

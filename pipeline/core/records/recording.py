@@ -1,4 +1,4 @@
-"""The data classes of a recording, of the noise of a sensor and of the motion of the body; functions of attitudes.
+"""The data classes of a recording, of the noise of a sensor and of the motion of the body; attitudes and axis maps.
 
 Units: time in integer nanoseconds since power-on, specific force in g (9.80665 m/s^2), angular rate in deg/s, angles in
 deg, temperature in degC. A channel that the file does not contain is ``None``.
@@ -14,6 +14,13 @@ Quaternions are (w, x, y, z), body to level with z up. The angular rate follows 
 
 by a quintic spline through the components: at 0.12 s between samples and 200 deg/s its truncation error is below
 1e-3 deg/s; the error of a central difference is 1 %.
+
+An axis map rotates readings from the sensor's axes to the body's,
+
+    body[m_i] = s_i * reading_i,   axis_map[i] = s_i m_i
+
+where axis i of the reading points along the body axis m_i with the sign s_i. Some chips have a left-handed
+accelerometer frame and a right-handed gyroscope frame, so that each sensor may have a separate map.
 """
 
 from __future__ import annotations
@@ -24,19 +31,22 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, ca
 
 import numpy as np
 
-from imu_logs.units import SECOND_NS
+from imu_logs.units import AXES, SECOND_NS, TRIADS
+from pipeline.core.errors import ConfigurationError
 from pipeline.core.records.budget import as_json, with_arrays
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable
+    from collections.abc import Callable, Hashable, Mapping, Sequence
 
     from numpy.typing import NDArray
     from scipy.interpolate import BSpline
 
     from imu_logs.log import Integers, Mask, Note, Values
+    from pipeline.core.settings import Sensor
 
 ReturnedQuantity = TypeVar("ReturnedQuantity")
 Arguments = ParamSpec("Arguments")
+STRAIGHT = ("+x", "+y", "+z")
 
 BETWEEN_ATTITUDES_S = 1000.0  # between the blocks of a file of attitudes, whose times are not known
 NOISE_OF_ROWS = "noise_of_rows"  # in the source of means: standard deviation of each by white noise, by sensor
@@ -92,7 +102,7 @@ class Recording:
     filter: dict[str, Any] = field(default_factory=lambda: {"name": "none", "delay_s": 0.0, "noise_gain": 1.0})
     clock_shared: bool = True  # whether the time between this recording and the unit's others is known
     setup: str = ""  # table, mounting or session of the recording; empty if the unit has only one
-    kind: str = ""  # in the sheet of the recordings (``pipeline.ingest.recordings_sheet``); empty without one
+    kind: str = ""  # in the sheet of the recordings (``pipeline.ingest.files``); empty without one
     # Body axis (+x, -z ..) that points up during a turn about a vertical axis; empty for other turns, where it follows
     # from the table's angle.
     up: str = ""
@@ -454,3 +464,43 @@ def rate_of_attitude(time: NDArray[np.float64], attitude: NDArray[np.float64]) -
     """Return the magnitude of the angular rate, (n,), deg/s, from an (n, 4) attitude at n >= 6 increasing times, s."""
     rate = quintic_spline(time, continuous(attitude))(time, 1)
     return np.asarray(2.0 * np.degrees(np.linalg.norm(rate, axis=1)))
+
+
+def axis_matrix(axis_map: Sequence[str]) -> Values:
+    """Return the (3, 3) signed permutation ``B`` of an axis map, ``body = B @ reading``."""
+    entries = [str(a) for a in axis_map]
+    if [a for a in entries if a[:1] not in "+-" or a[1:] not in AXES] or sorted(a[1:] for a in entries) != list(AXES):
+        raise ConfigurationError(
+            f"sensor.axis_map is [{', '.join(entries)}]; it names the body axis that the sensor's x, y and z point "
+            "along, each once and with its sign, for example [+y, -x, +z]"
+        )
+    matrix = np.zeros((3, 3))
+    for reading, entry in enumerate(entries):
+        matrix[AXES.index(entry[1:]), reading] = 1.0 if entry[0] == "+" else -1.0
+    return matrix
+
+
+def axis_maps(sensor: Sensor | None) -> dict[str, tuple[str, ...]]:
+    """Return the axis map of each sensor: its own, else that of the sensor model; straight without a model."""
+    return {s: STRAIGHT if sensor is None else tuple(sensor.of(s).axis_map or sensor.axis_map) for s in TRIADS}
+
+
+def maps_of_log(log: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """Return the axis maps in the section ``log`` of a calibration: one per sensor, in older files one for both."""
+    stated = log.get("axis_map") or STRAIGHT
+    return {s: tuple(stated[s] if isinstance(stated, dict) else stated) for s in TRIADS}
+
+
+def in_body_axes(axis_map: Sequence[str], readings: Values) -> Values:
+    """Rotate (n, 3) readings to the body's axes; return the same array if the map is straight."""
+    if tuple(axis_map) == STRAIGHT:
+        return readings
+    matrix = axis_matrix(axis_map)
+    turned: Values = readings[:, np.argmax(np.abs(matrix), axis=1)] * matrix.sum(axis=1)
+    return turned
+
+
+def map_of_orientation(text: str) -> tuple[str, ...]:
+    """Return the axis map of an orientation such as YxZ: body axis j is the reading named by letter j."""
+    found = {name.lower(): ("+" if name.isupper() else "-") + body for name, body in zip(text, AXES, strict=True)}
+    return tuple(found[axis] for axis in AXES)

@@ -45,9 +45,8 @@ from pipeline.core.records import (
     coverage_factor,
 )
 from pipeline.core.settings import DataSheet, Settings
-from pipeline.estimation.engine import LinearMap, ScaledColumns
+from pipeline.estimation.engine import LinearMap, ScaledColumns, quadratic_results, through, with_trials
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, WanderPrior
-from pipeline.estimation.monte_carlo import quadratic_results, through, with_trials
 from pipeline.estimation.multi_position.accelerometer import (
     PARAMETERS,
     AccelerometerModel,

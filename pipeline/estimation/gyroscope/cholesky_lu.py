@@ -67,9 +67,8 @@ from pipeline.core.records import (
     Values,
 )
 from pipeline.core.settings import Settings, Table
-from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative, linear_convergence
+from pipeline.estimation.engine import LinearMap, ScaledColumns, derivative, linear_convergence, with_matrix
 from pipeline.estimation.gauss_markov import block_covariance
-from pipeline.estimation.monte_carlo import with_matrix
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
 from pipeline.estimation.multi_position.faces_and_turns import TurnsByHand, across_axis, turns_of
 from pipeline.estimation.multi_position.gyroscope import between_recordings

@@ -31,8 +31,7 @@ from pipeline.core.records import (
     base_values,
 )
 from pipeline.core.settings import Procedure, Settings
-from pipeline.estimation.engine import draw_normal, scaled_inverse
-from pipeline.estimation.monte_carlo import quadratic_results, with_trials
+from pipeline.estimation.engine import draw_normal, quadratic_results, scaled_inverse, with_trials
 from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
 from pipeline.estimation.multi_position.fit import FitByHand, fit

@@ -71,7 +71,7 @@ from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, samples_o
 from pipeline.evaluation.held_out.validation import HeldOutError, last_error, static_error
 from pipeline.physics.effects import catalogue, effect, effect_of
 from pipeline.physics.effects.base import parameter_limits, truth, unit_of
-from pipeline.physics.effects.free_curves import OTHER_PREFIX
+from pipeline.physics.effects.equations import OTHER_PREFIX
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.measurement import linear_truth
 from pipeline.physics.statements import not_determined

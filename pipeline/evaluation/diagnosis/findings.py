@@ -43,7 +43,7 @@ from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
 from pipeline.evaluation.diagnosis.verdict import if_observable
 from pipeline.evaluation.diagnosis.words import experiment_of, listed, of_unknown, plain, to_distinguish
 from pipeline.physics.effects import catalogue, effect
-from pipeline.physics.effects.free_curves import OTHER_PREFIX
+from pipeline.physics.effects.equations import OTHER_PREFIX
 
 IMITATED = 0.5  # share of an unexplained sensor's answers in which effects of the catalogue are imitations: undecided
 LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings

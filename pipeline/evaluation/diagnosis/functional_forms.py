@@ -23,7 +23,7 @@ import numpy as np
 from pipeline.core.records import Motion, Values
 from pipeline.estimation.observations import Observations
 from pipeline.physics.effects.base import truth, unit_of
-from pipeline.physics.effects.free_curves import CURVE_DEGREE
+from pipeline.physics.effects.equations import CURVE_DEGREE
 from pipeline.physics.formula import parse
 
 CYCLES = range(1, 13)

@@ -58,7 +58,7 @@ from pipeline.evaluation.diagnosis.form_scan import ProjectedCurves, Scan, White
 from pipeline.evaluation.diagnosis.functional_forms import Curves, Span, available_signals, columns_of, signals_of
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import Layout, truth, unit_of
-from pipeline.physics.effects.free_curves import CURVE_DEGREE, MAX_CURVE_CYCLES
+from pipeline.physics.effects.equations import CURVE_DEGREE, MAX_CURVE_CYCLES
 from pipeline.physics.formula import parse
 
 Block = tuple[Sequence[int], int]  # curves that are tried together: the first so many of them, and each further one

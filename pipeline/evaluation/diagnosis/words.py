@@ -15,7 +15,7 @@ from pipeline.core.verdicts import Verdict, figure_and_size
 from pipeline.estimation.candidates import FIXED_AT_ZERO, TILT, is_fixed
 from pipeline.physics.effects import catalogue
 from pipeline.physics.effects.base import largest_by_unit, unit_of
-from pipeline.physics.effects.free_curves import OTHER_PREFIX
+from pipeline.physics.effects.equations import OTHER_PREFIX
 
 MOST_ANSWERS = 4  # answers of an answer set that a sentence lists
 STAYS = 1.15  # times the noise floor: two standard deviations of the rms of 100 samples, 1 / sqrt(200) each

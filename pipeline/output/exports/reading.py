@@ -40,12 +40,13 @@ from pipeline.core.records import (
     SCHEMA_VERSION,
     SENSOR_UNITS,
     SENSORS,
+    STRAIGHT,
     Coefficient,
     FittedEffect,
     SensorCalibration,
     Values,
+    maps_of_log,
 )
-from pipeline.ingest.axis_maps import STRAIGHT, maps_of_log
 from pipeline.output.exports import ExportedUnit, Format, export, formats, text_of
 from pipeline.output.exports.sensors import SI, TEMPLATE_FUNCTIONS, UNIT_FACTORS, SensorFigures, before_use
 from pipeline.output.exports.text_kinds import Expressions, Node, parsed

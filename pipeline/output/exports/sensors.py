@@ -28,10 +28,9 @@ import numpy as np
 import scipy
 
 from pipeline.core.files import JSON
-from pipeline.core.records import AXES, BIAS, SENSORS, Reduced, SensorCalibration, Values
+from pipeline.core.records import AXES, BIAS, SENSORS, STRAIGHT, Reduced, SensorCalibration, Values, maps_of_log
 from pipeline.core.settings import DataSheet
 from pipeline.estimation.noise_terms import allan_variance
-from pipeline.ingest.axis_maps import STRAIGHT, maps_of_log
 from pipeline.physics.compensation import MIN_EXPORTED_TIME_S
 from pipeline.physics.effects import owner_of
 from pipeline.physics.effects.base import OF_THE_BIAS, REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
