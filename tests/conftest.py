@@ -21,6 +21,11 @@ settings.register_profile("fixed", derandomize=True, deadline=None, suppress_hea
 settings.load_profile("fixed")
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """Return one worker more than cores: those that run campaigns wait for Snakemake a tenth of their time."""
+    return 1 + (os.cpu_count() or 1)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run whole campaigns first and short files last: a long file at the end would leave the other worker idle."""
     items.sort(key=lambda item: (item.get_closest_marker("workflow") is None, item.path.parent.name in SHORT))
