@@ -128,6 +128,13 @@ def test_an_effect_that_nobody_knows_of_is_not_named() -> None:
     assert found["whole"]["selected"] == ["bias_drift"]
 
 
+def test_what_is_impossible_is_no_cause_where_it_also_raises_the_held_out_error() -> None:
+    """Without the lag, an offset and 106 times the limit of ``scale_factor_temperature`` fit best."""
+    case = draw("removed", 28, 4203)
+    (found,) = judge(case)
+    assert (case.left_out, found["verdict"], found["selected"]) == (("low_pass_lag",), "unexplained", [])
+
+
 @pytest.mark.parametrize(("family", "number"), [("shape_saturation", 6), ("single", 20)])
 def test_a_bend_of_the_temperature_is_an_answer_beside_the_warm_up_that_it_looks_like(family: str, number: int) -> None:
     case = draw(family, number, 61)

@@ -88,7 +88,7 @@ MIN_STRETCHES = 8  # stretches, which determine a standard deviation to a quarte
 
 def without_harmful(found: SensorDiagnosis, harmful: Mapping[str, str]) -> SensorDiagnosis:
     """Return the diagnosis without the selected effects that raise the held-out error; all become candidates."""
-    found = replace(found, candidates={**found.candidates, **harmful})
+    found = replace(found, candidates={**harmful, **found.candidates})
     harmful = {name: reason for name, reason in harmful.items() if name in found.selected}
     if not harmful:
         return found
@@ -212,7 +212,7 @@ def diagnose(
             doubts += _doubts_of_axes(leaning, calibration)
         evidence = replace(evidence, doubts=doubts, moves=moves, scatter=_scatter(calibration))
         found = judged(found, evidence)
-        found = without_impossible(without_harmful(found, findings.harmful if findings else {}), case)
+        found = without_harmful(without_impossible(found, case), findings.harmful if findings else {})
         found = with_unknown(found) if found.verdict == Verdict.UNEXPLAINED else found
         return found, full or may_be_unknown(found.verdict, evidence)
 
