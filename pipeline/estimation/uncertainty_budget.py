@@ -197,12 +197,12 @@ def changes_by_hand(
     return found
 
 
-def gain_of(model: Model, fitted: FitByHand, place: Values) -> Values:
+def gain_of(fitted: FitByHand, place: Values) -> Values:
     """Return the change of bias and matrix by a change of the residuals of rests and moves: (12, n) array.
 
     ``place``: (12 + e, b + e), from the parameters of the fit to bias, matrix and effects.
     """
-    equations = model.equations(fitted.state)
+    equations = fitted.equations
     n, scale = len(equations.residual), max(fitted.hypotheses, key=lambda hypothesis: hypothesis[1])[2]
     white, _ = equations.whitened(fitted.noise, np.column_stack([equations.columns, np.eye(n)]), scale)
     X, root = white[:, :-n], white[:, -n:]

@@ -141,13 +141,14 @@ def fit(task: StageInput) -> SensorCalibration:
     def fit_with(held: Mapping[str, float], whole: GyroscopeModel = model) -> tuple[Robust, Values]:
         part = copy(whole)
         part.known_by_limit = held
-        base = part.equations(start).base
+        equations = part.equations(start)
+        base = equations.base
         if ScaledColumns.of(base, MIN_NEW_NORM_SHARE).rank < base.shape[1]:
             raise CannotCalibrateError(
                 "the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: "
                 f"{advice}"
             )
-        found = fit_robustly(part, fit_model, filtered)
+        found = fit_robustly(part, partial(fit_model, known=(equations, None)), filtered)
         # limits and axes are of the case: no gyroscope shows the frame of the accelerometer in it
         return found, np.sqrt(np.maximum(np.diag(found[1].covariance)[MATRIX] - of_frame, 0.0))
 

@@ -361,18 +361,18 @@ def fit(
     limits: Limits,
     freedom: float | None = None,
     *,
-    known: tuple[Equations, Values] | None = None,
+    known: tuple[Equations, Values | None] | None = None,
     small: float = SMALL_LAST_STEP,
 ) -> FitByHand:
     """Fit bias, matrix and effects from given values.
 
     ``freedom``: degrees of freedom of the noise's scale, if other readings determine it; by default of the residuals.
-    ``known``: the equations at the start, and log L under each hypothesis after one step. ``small``: the last step over
-    the standard uncertainty.
+    ``known``: the equations at the start and, if computed, log L under each hypothesis after one step. ``small``: the
+    last step over the standard uncertainty.
     """
     state, rounds, best, scale = start, 0, -1, 0.0
-    equations = known[0] if known else model.equations(state)
-    scores = known[1] if known else log_likelihoods(equations, hypotheses)
+    equations, scores = known or (model.equations(state), None)
+    scores = log_likelihoods(equations, hypotheses) if scores is None else scores
     while True:
         prior = _prior(model, state, limits)
         likeliest = int(np.argmax(scores))

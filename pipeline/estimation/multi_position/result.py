@@ -149,7 +149,7 @@ def _at_limits(
     model: Model, fitted: FitByHand, place: Values, other: SensorCalibration | None, settings: Settings
 ) -> dict[str, Values]:
     """Return the change of bias and matrix by each effect at its limits; ``other``: of the accelerometer."""
-    gain, modelled = gain_of(model, fitted, place), [term.effect.name for term in fitted.state.terms]
+    gain, modelled = gain_of(fitted, place), [term.effect.name for term in fitted.state.terms]
     found = changes_by_hand(model, fitted, gain, modelled, settings.sensor.of(model.sensor))
     if isinstance(model, gyroscope.GyroscopeModel) and other is not None:
         found |= changes_through_gravity(model, fitted, gain, other, settings.sensor.accelerometer)

@@ -335,9 +335,11 @@ def _turn(recording: Recording, rest: Rest) -> str:
     blocks = force[: 4 * quarter].reshape(4, quarter, 3)
     means, length = blocks.mean(axis=1), float(np.linalg.norm(force.mean(axis=0)))
     moved = float(np.max(np.linalg.norm(means[:, None] - means[None], axis=2)))
-    noise = float(np.sqrt(blocks.var(axis=1).sum(axis=1).mean() / quarter))
     angle = np.degrees(moved / length) if length > 0 else 0.0
-    if angle <= TURN_LIMIT_DEG or moved <= SIGNIFICANT_REST_DEVIATIONS * noise:
+    if angle <= TURN_LIMIT_DEG:
+        return ""
+    noise = float(np.sqrt(blocks.var(axis=1).sum(axis=1).mean() / quarter))
+    if moved <= SIGNIFICANT_REST_DEVIATIONS * noise:
         return ""
     return f"direction of the specific force moves by {angle:.1f} deg (limit {TURN_LIMIT_DEG:g} deg)"
 
