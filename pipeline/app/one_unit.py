@@ -127,21 +127,13 @@ class ConfiguredUnit:
             yield
 
 
-@dataclass
-class TriedUnit:
-    """A unit after the steps that were tried, and the failure record of a run; None if no step failed."""
-
-    state: UnitState
-    failure: dict[str, Any] | None = None
-
-
-def try_unit(unit: ConfiguredUnit, until: str, *, fits: bool = True) -> TriedUnit:
-    """Run the steps of a unit as a run does, where an error stops only this unit."""
+def try_unit(unit: ConfiguredUnit, until: str, *, fits: bool = True) -> tuple[UnitState, dict[str, Any] | None]:
+    """Run the steps of a unit as a run does; return its state, and the failure record of a run, or None."""
     state = unit.state()
     try:
-        return TriedUnit(unit.run_to(until, fits=fits, state=state))
+        return unit.run_to(until, fits=fits, state=state), None
     except Exception as error:  # noqa: BLE001  (as in a run)
-        return TriedUnit(state, failure_of(error, unit.row.name, state.task))
+        return state, failure_of(error, unit.row.name, state.task)
 
 
 def unit_of_campaign(campaign: Campaign, unit: str) -> ConfiguredUnit:

@@ -53,16 +53,7 @@ LAST_STAGE = "report"  # its units are counted as done
 NAMED_JOBS, NAMED_UNITS_OF_RUN = 2, 10
 INTERVAL = {True: 1.0, False: 30.0}  # s between lines, on a terminal and elsewhere
 CLEAR_LINE = "\r\x1b[K"
-LOG_EVENTS = (
-    "JOB_INFO",
-    "JOB_STARTED",
-    "JOB_FINISHED",
-    "PROGRESS",
-    "SHELLCMD",
-    "RUN_INFO",
-    "RESOURCES_INFO",
-    "GROUP_INFO",
-)
+EVENTS = ("JOB_INFO", "JOB_STARTED", "JOB_FINISHED", "PROGRESS", "SHELLCMD", "RUN_INFO", "RESOURCES_INFO", "GROUP_INFO")
 SCHEDULER_MESSAGES = ("Select jobs to execute", "Execute ")
 # Snakemake's reports of a failed job: the last lines of a run state the cause, Snakemake's log has the reports
 JOB_FAILURES = ("RuleException", "Exiting because a job", "WorkflowError:\nAt least one job did not complete")
@@ -309,11 +300,8 @@ class Monitor(logging.Handler):
     def print_edited(self, edited: Sequence[str]) -> None:
         """Print the files that are computed again because they were edited or deleted."""
         if edited:
-            lines = [
-                "Changed or deleted since the last run, computed again:",
-                *(f"  {line}" for line in shortened(edited, NAMED_UNITS_OF_RUN)),
-            ]
-            print("\n".join(lines), file=self.stream, flush=True)
+            lines = "".join(f"\n  {line}" for line in shortened(edited, NAMED_UNITS_OF_RUN))
+            print(f"Changed or deleted since the last run, computed again:{lines}", file=self.stream, flush=True)
 
     def print_recovery(self) -> None:
         """Print the failed jobs and the command that recovers, after Snakemake's last message."""
@@ -347,7 +335,7 @@ class Monitor(logging.Handler):
 
         def passes(record: logging.LogRecord) -> bool:
             text = str(record.msg)
-            if _event(record) in (*LOG_EVENTS, "JOB_ERROR") or text.startswith((*SCHEDULER_MESSAGES, *JOB_FAILURES)):
+            if _event(record) in (*EVENTS, "JOB_ERROR") or text.startswith((*SCHEDULER_MESSAGES, *JOB_FAILURES)):
                 return False
             self.stream.write(clear)
             return True

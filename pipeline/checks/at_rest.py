@@ -196,16 +196,12 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_model:
             "remove it, the noise is then taken from the rests of the other recordings, or record it again",
         )
     t = recording.time
-    detail = (
-        f"only {place(recording, start, stop - 1)} are used of {t[0]:.6g} to {t[-1]:.6g} s: the rest of it moves; {why}"
-    )
+    detail = f"only {place(recording, start, stop - 1)} are used of {t[0]:.6g} to {t[-1]:.6g} s: the rest moves; {why}"
     note = Note("N-MOVED", left_out, 0, 0, detail, float(t[0]), float(t[-1]))
     return replace(recording.select(slice(start, stop)), notes=(*recording.notes, note))
 
 
-def _moving(
-    recording: Recording, sensor: str, blocks: Values, data_sheet: DataSheet, rests: Values
-) -> tuple[Mask, str]:
+def _moving(recording: Recording, sensor: str, blocks: Values, sheet: DataSheet, rests: Values) -> tuple[Mask, str]:
     """Return in which blocks a sensor moves, and the strongest evidence of it in words."""
     unit = SENSOR_UNITS[sensor]
     means, scatter = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
@@ -213,7 +209,7 @@ def _moving(
     tiny = np.finfo(float).tiny
     spread = np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE
     louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * np.minimum(spread, MAX_SCATTER_DEVIATION)))
-    white = data_sheet.white(recording.interval)
+    white = sheet.white(recording.interval)
     if len(rests):
         usual = np.minimum(usual, MAX_TIMES_RESTS * np.maximum(np.median(rests[:, 0], axis=0), white))
     elif white:
@@ -222,7 +218,7 @@ def _moving(
     loud = scatter / usual
     away = np.abs(means - median(means))
     change = UNKNOWN_DEGC if recording.temperature is None else float(np.ptp(recording.temperature))
-    slow = _slow(data_sheet, change, float(recording.time[-1] - recording.time[0]))
+    slow = _slow(sheet, change, float(recording.time[-1] - recording.time[0]))
     allowed = slow + SIGNIFICANT_DEVIATIONS_AT_REST * usual
     moving = np.any(loud > louder, axis=1) | np.any(away > allowed, axis=1)
     if np.any(loud > louder):

@@ -7,8 +7,9 @@ so that a few spikes do not change it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from pipeline.core.errors import IngestError
 from pipeline.core.records import (
     AXES,
     SENSORS,
+    Mask,
+    Recording,
+    Values,
     conjugate_product,
     continuous,
     median,
@@ -23,14 +27,8 @@ from pipeline.core.records import (
     once,
     once_of_log,
 )
+from pipeline.core.settings import Settings
 from pipeline.ingest.quality_flags import GAP_INTERVALS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.records import Mask, Recording, Values
-    from pipeline.core.settings import Settings
-
 
 EXPANDED = 3.0  # coverage of a stated standard uncertainty: 99.7 % of a normal distribution
 OPPOSITE = 0.8  # correlation from which two channels differ in sign alone

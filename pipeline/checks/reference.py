@@ -39,14 +39,15 @@ a doubt.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.checks.evidence import (
     LEAST_RATE_DPS,
     OPPOSITE,
+    Channel,
     ChannelLimits,
     alike,
     axis_index,
@@ -68,19 +69,10 @@ from pipeline.checks.reference_scale import (
     doubt_of_angle,
     doubt_of_scale,
 )
-from pipeline.core.records import Note, median, once
+from pipeline.core.records import Index, Mask, Note, Recording, Values, median, once
+from pipeline.core.settings import Settings
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.checks.evidence import Channel
-    from pipeline.core.records import Index, Recording, Values
-
-    Found = tuple[str, int, int, int]  # text with the places {name} and {names}; number of rows, first and last sample
-    from collections.abc import Mapping
-
-    from pipeline.core.records import Mask
-    from pipeline.core.settings import Settings
+Stretches = tuple[str, int, int, int]  # text with the places {name} and {names}; number of rows, first and last sample
 
 
 BY_NOISE = 10.0  # standard deviations, as of disturbances (pipeline.ingest.disturbances)
@@ -161,7 +153,7 @@ class ChannelComparison:
             gross, stated = off - gross, off - stated
         return np.where(np.isfinite(gross), gross, -np.inf), np.where(np.isfinite(stated), stated, -np.inf)
 
-    def _worst_row(self, claim: Channel, others: list[Channel], excess: Sequence[Values]) -> Found | None:
+    def _worst_row(self, claim: Channel, others: list[Channel], excess: Sequence[Values]) -> Stretches | None:
         least = np.min(excess, axis=0)
         rows = np.flatnonzero(least > 0.0)
         if not rows.size:
@@ -180,7 +172,7 @@ class ChannelComparison:
         )
         return text, rows.size, first, last
 
-    def _worst_stretch(self, claim: Channel, others: list[Channel]) -> Found | None:
+    def _worst_stretch(self, claim: Channel, others: list[Channel]) -> Stretches | None:
         limits, n = self.limits, len(self.dt)
         for size in sorted({SHORT_STRETCH_SAMPLES, max(n // LONG_STRETCHES, SHORT_STRETCH_SAMPLES)}):
             starts = np.arange(0, max(n - size // 2, 1), size)

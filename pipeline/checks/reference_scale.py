@@ -27,12 +27,14 @@ harmonics up to the third, a delay (rate times the first harmonic), a lever arm,
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.checks.evidence import (
     EXPANDED,
+    ChannelLimits,
     axis_index,
     gaps,
     gravity_turned,
@@ -43,17 +45,12 @@ from pipeline.checks.evidence import (
     ratio_quantiles,
     refusal,
 )
-from pipeline.core.records import MEDIAN_SIZE
+from pipeline.core.errors import IngestError
+from pipeline.core.records import MEDIAN_SIZE, Mask, Recording, Values
+from pipeline.core.settings import Table
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+Units = Sequence[tuple[float, str]]
 
-    from pipeline.checks.evidence import ChannelLimits
-    from pipeline.core.errors import IngestError
-    from pipeline.core.records import Mask, Recording, Values
-    from pipeline.core.settings import Table
-
-    Units = Sequence[tuple[float, str]]
 
 RATIO_BLOCKS = 96  # of a recording, so that each holds a part of a turn
 GRAVITY_TOLERANCE = 0.2  # of a ratio to the angle by gravity: two times 6 deg in 60

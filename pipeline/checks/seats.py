@@ -64,7 +64,7 @@ MAX_SEAT_CHI_SQUARE = 33.0  # chi-square of at most 13 degrees of freedom with a
 GAUGE = 1e-6  # weight with which the seats have the smallest sum of squares
 # Columns of the design of ``_fit``: K comes before the bias.
 K_COLUMNS, BIAS_COLUMNS = slice(0, len(MATRIX_NAMES)), slice(len(MATRIX_NAMES), BASE_COUNT)
-QUARTER_TURNS_DEG = np.array([0.0, 90.0, 180.0, 270.0])
+QUARTERS_DEG = np.array([0.0, 90.0, 180.0, 270.0])
 TABLE_EFFECTS = ("table_tilt", "table_axis_nonorthogonality")
 # Largest plausible tilt (deg), lean (deg) and time offset (s) where the sensor's config states none.
 BENCH_LIMITS = {"table_tilt": 1.0, "table_axis_nonorthogonality": 1.0, "time_offset": 0.04}
@@ -183,11 +183,9 @@ def _fit(turns: Sequence[_Conventional], K: Values, columns: Values, limits: Seq
 
 def _columns_of(name: str, turn: _Conventional) -> Values:
     """Return the derivative of c, p and q by the m parameters of a table effect, 1/deg: (3, 3, m) array."""
-    force, level = (
-        turn_about_axis(v, turn.axis, -QUARTER_TURNS_DEG) for v in (turn.ideal[0], level_at_zero(turn.axis))
-    )
-    rest = motion_at_rest(QUARTER_TURNS_DEG)
-    motion = replace(rest, specific_force=force, level=level, axis=turn.axis, angle=QUARTER_TURNS_DEG, rate=np.zeros(4))
+    force, level = (turn_about_axis(v, turn.axis, -QUARTERS_DEG) for v in (turn.ideal[0], level_at_zero(turn.axis)))
+    rest = motion_at_rest(QUARTERS_DEG)
+    motion = replace(rest, specific_force=force, level=level, axis=turn.axis, angle=QUARTERS_DEG, rate=np.zeros(4))
     of = effect(name)
     at_0, at_90, at_180, at_270 = of.regressors(
         "accelerometer", motion, np.eye(3), np.zeros(len(of.parameters("accelerometer")))

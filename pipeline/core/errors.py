@@ -17,24 +17,8 @@ from typing import Any
 from imu_logs.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, InputError, MissingInputError
 from imu_logs.errors import UserError as PipelineError
 
-__all__ = [
-    "UNKNOWN_LAYOUT",
-    "CannotCalibrateError",
-    "ConfigurationError",
-    "ConvergenceError",
-    "DamagedFileError",
-    "IngestError",
-    "InputError",
-    "InternalError",
-    "MissingInputError",
-    "NotObservableError",
-    "PipelineError",
-    "as_published",
-    "failure_of",
-    "is_of_run",
-    "omission",
-    "shortened",
-]
+# Those of ``imu_logs``, beside the names below.
+__all__ = ["UNKNOWN_LAYOUT", "ConfigurationError", "IngestError", "InputError", "MissingInputError", "PipelineError"]
 
 
 class DamagedFileError(InputError):

@@ -124,9 +124,7 @@ def json_text(value: Any, levels: int = 3, indent: str = "\n") -> str:  # noqa: 
         members = list(value.values() if isinstance(value, dict) else value)
         if any(isinstance(member, dict | list | tuple) for member in members):
             names = (
-                [f"{encode_basestring(str(name))}: " for name in value]
-                if isinstance(value, dict)
-                else [""] * len(members)
+                [f"{encode_basestring(str(n))}: " for n in value] if isinstance(value, dict) else [""] * len(members)
             )
             inner = indent + " "
             lines = [name + json_text(m, levels - 1, inner) for name, m in zip(names, members, strict=True)]

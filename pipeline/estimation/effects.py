@@ -136,45 +136,43 @@ def model_of(
     return gyroscope.model_of(recordings, calibration, noise, settings.procedure, other, frame_deg=frame_deg)
 
 
-def fit_effects_by_rests(
-    before: SensorCalibration, recordings: UnitRecordings, settings: Settings
-) -> SensorCalibration:
+def fit_effects_by_rests(start: SensorCalibration, recordings: UnitRecordings, settings: Settings) -> SensorCalibration:
     """Fit the effects of ``settings.effects`` together with bias and matrix to rests and moves.
 
-    ``before``: of the sensor's method; returned unchanged where there is no effect to add. Raises
+    ``start``: of the sensor's method; returned unchanged where there is no effect to add. Raises
     ``NotObservableError`` if rests and moves do not determine an effect; ``ConfigurationError`` if an effect is unknown
     or not of this sensor.
     """
-    sensor = before.sensor
+    sensor = start.sensor
     wanted, data_sheet = settings.effects.of(sensor), settings.sensor.of(sensor)
     noise, other = recordings.noises[sensor], None
     if sensor == "gyroscope":
         other = accelerometer_of(recordings, settings)
-    model = model_of(recordings.filtered, before, noise, settings, other)
+    model = model_of(recordings.filtered, start, noise, settings, other)
     if model is None:
-        return before
+        return start
     names = [] if wanted == AUTO else list(wanted)
     if wanted == AUTO:
-        chosen = SelectionByHand(model, before, [], noise, data_sheet)
+        chosen = SelectionByHand(model, start, [], noise, data_sheet)
         added = offered(chosen.names, chosen.fit.state.terms, chosen.fit.covariance, data_sheet, sensor)
         parts = [(model.without(rests), rests) for rests in rests_in_turn(model)] if added else []
         harm = left_out(chosen, parts).harmful(chosen.names) if parts else {}
         names = [name for name in added if name not in harm]
     if not names:
-        return before
+        return start
     for name in names:
         reason = refusal(effect(name), sensor, model.rests) if sensor in effect(name).sensors else ""
         if reason:
             raise NotObservableError(f"{name} cannot be fitted by hand: {reason}; take it out of effects.{sensor}")
     hypotheses = selection_hypotheses(noise, model.kinds)
     limits = limits_of(sensor, data_sheet)
-    fitted = fit_configured(model, before, names, hypotheses)
+    fitted = fit_configured(model, start, names, hypotheses)
     if plausible(fitted, limits):
-        fitted = fit_configured(model, before, names, hypotheses, limits)
+        fitted = fit_configured(model, start, names, hypotheses, limits)
     if len(fitted.residual) <= fitted.rank:
         raise NotObservableError(
             f"{len(model.rests.time)} rests of the {sensor} are too few for {', '.join(names)} in addition to bias and "
             f"matrix: {fitted.more_rests}"
         )
     require_observable(model, fitted, limits)
-    return calibration_of(model, fitted, before, settings, other)
+    return calibration_of(model, fitted, start, settings, other)

@@ -269,9 +269,7 @@ def _residual_noise(
     return replace(found, white_variance=found.white_variance * design.scale**2)
 
 
-def fit_best(
-    observations: Observations, choices: Sequence[Terms], start: Start, settings: Sequence[Setting]
-) -> JointFit:
+def fit_best(observed: Observations, choices: Sequence[Terms], start: Start, settings: Sequence[Setting]) -> JointFit:
     """Fit from the combination of starts among ``choices`` with the largest likelihood after one linear step.
 
     Effects of timing are first fitted with the base alone: far from their values a linear step is inaccurate, and other
@@ -282,19 +280,19 @@ def fit_best(
         begin, possible = start, choices
         timing = [term for term in choices[0] if term.effect.moves and not np.any(term.values)]
         if timing and len(timing) < len(choices[0]):  # they move the rows, and so change the likelihood of the starts
-            begin = fit_terms(observations, timing, start, settings)
+            begin = fit_terms(observed, timing, start, settings)
             fitted = {term.effect.name: term.values for term in begin.terms}
             possible = [[replace(t, values=fitted.get(t.effect.name, t.values)) for t in each] for each in choices]
 
         def likelihood(terms: Terms) -> float:
-            design = design_at(observations, _with_all_columns(begin, terms))
-            return _solve(design, observations, settings).log_likelihood
+            design = design_at(observed, _with_all_columns(begin, terms))
+            return _solve(design, observed, settings).log_likelihood
 
         chosen = possible[0] if len(possible) == 1 else max(possible, key=likelihood)
-        return fit_terms(observations, chosen, begin, settings)
+        return fit_terms(observed, chosen, begin, settings)
 
     key = fit_best, start.key, tuple(tuple(term.key for term in terms) for terms in choices), tuple(settings)
-    return observations.once(key, best)
+    return observed.once(key, best)
 
 
 def require_observable(observations: Observations, fit: JointFit) -> None:

@@ -17,10 +17,10 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError
-from pipeline.core.records import Coefficient, FittedEffect
+from pipeline.core.records import FittedEffect
 from pipeline.core.settings import DataSheet
 from pipeline.estimation.stages import FitStage
-from pipeline.physics.effects import effect
+from pipeline.physics.effects import fitted_effect
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 
 NAME = "known_temperature"
@@ -39,16 +39,7 @@ def known(sensor: str, data_sheet: DataSheet) -> list[FittedEffect]:
             f"sensor.{sensor}.{NAME} states neither bias nor scale_factor: state a coefficient, or choose another "
             f"method.{sensor}"
         )
-    return [
-        FittedEffect(
-            name,
-            {
-                p.name: Coefficient(value, p.unit)
-                for p, value in zip(effect(name).parameters(sensor), of_axes.tolist(), strict=True)
-            },
-        )
-        for name, of_axes in values.items()
-    ]
+    return [fitted_effect(name, sensor, of_axes) for name, of_axes in values.items()]
 
 
 FIT_STAGES = {NAME: FitStage(changes=("readings",), known=known)}

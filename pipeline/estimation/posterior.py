@@ -154,9 +154,7 @@ class SetSearch:
     def _beam(self) -> None:
         level = [self.required]
         while level:
-            level = self._near(
-                sorted(self._extend(level), key=lambda names: -self.pool[names].score)[:BEAM], BEAM_LOG_EVIDENCE
-            )
+            level = self._near(sorted(self._extend(level), key=lambda n: -self.pool[n].score)[:BEAM], BEAM_LOG_EVIDENCE)
             for names in level:
                 self._finish(names)
             level = self._near(level, EXTENDED_LOG_EVIDENCE)

@@ -124,18 +124,14 @@ def rests_by_use(recordings: Sequence[Recording], procedure: Procedure) -> dict[
 
 def rest_uses(pairs: Iterable[tuple[Recording, Rest]]) -> list[RestUse]:
     """Return the descriptions of rests."""
-    return [
-        RestUse(
-            recording=recording.name,
-            time_s=float(recording.time[rest.start]),
-            duration_s=float(recording.time[rest.stop - 1] - recording.time[rest.start]),
-            creep_dps=0.0
-            if recording.accelerometer is None
-            else float(np.linalg.norm(creep_of_rest(recording, rest.start, rest.stop).rate)),
-            reason=rest.reason,
-        )
-        for recording, rest in pairs
-    ]
+    uses = []
+    for recording, rest in pairs:
+        start, last = recording.time[[rest.start, rest.stop - 1]].tolist()
+        known = recording.accelerometer is not None
+        creep = float(np.linalg.norm(creep_of_rest(recording, rest.start, rest.stop).rate)) if known else 0.0
+        about = {"recording": recording.name, "reason": rest.reason}
+        uses.append(RestUse(**about, time_s=start, duration_s=last - start, creep_dps=creep))
+    return uses
 
 
 def rest_means(recording: Recording, rests: Sequence[Rest], sensor: str = "accelerometer") -> tuple[Values, Integers]:

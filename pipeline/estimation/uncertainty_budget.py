@@ -101,15 +101,13 @@ GRAVITY = "local gravity"
 MAX_CHANGED_SAMPLES = 20_000
 
 
-def limited_effects(
-    sensor: str, modelled: Collection[str], data_sheet: DataSheet
-) -> Iterator[tuple[Effect, Values, Values]]:
+def limited_effects(sensor: str, known: Collection[str], sheet: DataSheet) -> Iterator[tuple[Effect, Values, Values]]:
     """Yield each effect of the sensor file that is not in the model, its start, and the limits of its coefficients.
 
     An effect with time constants has several starts; limits of time constants are 0.
     """
-    limits = limits_of(sensor, data_sheet)
-    within = {*modelled, *(name for other in modelled for name in effect(other).contains)}
+    limits = limits_of(sensor, sheet)
+    within = {*known, *(name for other in known for name in effect(other).contains)}
     for name, this in catalogue().items():
         if name in within or sensor not in this.sensors or sensor in this.unseen or this.owner not in OWNERS:
             continue
@@ -309,12 +307,10 @@ def gravity_line(calibration: SensorCalibration, table: Table) -> BudgetLines:
     return [type_b(GRAVITY, NORMAL, u, "g", effect)], {}
 
 
-def clock_contribution(
-    calibration: SensorCalibration, ppm: float, kind: str = NORMAL, remark: str = ""
-) -> Contribution:
+def clock_contribution(fit: SensorCalibration, ppm: float, kind: str = NORMAL, remark: str = "") -> Contribution:
     """Return the contribution of the sensor's clock, for rates that are an angle over its time: ``dM = M de``."""
-    effect = np.zeros((len(calibration.parameters), 1))
-    effect[MATRIX, 0] = 1e-6 * calibration.matrix.ravel()
+    effect = np.zeros((len(fit.parameters), 1))
+    effect[MATRIX, 0] = 1e-6 * fit.matrix.ravel()
     return type_b(TIME_BASE, kind, ppm, "ppm", effect, remark)
 
 
@@ -326,14 +322,12 @@ def clock_line(calibration: SensorCalibration, table: Table) -> BudgetLines:
     return [clock_contribution(calibration, ppm)], {}
 
 
-def combined(
-    calibration: SensorCalibration, lines: Sequence[Contribution], missing: Mapping[str, str]
-) -> SensorCalibration:
+def combined(fit: SensorCalibration, lines: Sequence[Contribution], missing: Mapping[str, str]) -> SensorCalibration:
     """Return a calibration with the covariance and the degrees of freedom of all contributions together.
 
     ``lines``: contributions to all of its parameters. ``missing``: source to the reason why it is not included.
     """
-    parameters = calibration.parameters
+    parameters = fit.parameters
     covariance, freedom = np.zeros((len(parameters),) * 2), np.full(len(parameters), np.inf)
     if lines:
         covariance = np.sum([c.covariance for c in lines], axis=0)
@@ -341,7 +335,7 @@ def combined(
         freedom = effective_degrees_of_freedom(u, np.array([c.degrees_of_freedom for c in lines]))
     reasons, sources = {**missing, "repeatability": f"{NOT_STATED}, and compare"}, {c.source for c in lines}
     left_out = tuple(NotIncluded(source, reason) for source, reason in reasons.items() if source not in sources)
-    return with_uncertainty(calibration, covariance, freedom, Budget(tuple(c.line() for c in lines), left_out))
+    return with_uncertainty(fit, covariance, freedom, Budget(tuple(c.line() for c in lines), left_out))
 
 
 def budgeted(  # noqa: PLR0917  (what a fit on a table is)
@@ -443,18 +437,16 @@ def effect_parameters(
     return tuple(effects), parameters
 
 
-def with_uncertainty(
-    calibration: SensorCalibration, covariance: Values, freedom: Values, budget: Budget
-) -> SensorCalibration:
+def with_uncertainty(fit: SensorCalibration, covariance: Values, freedom: Values, budget: Budget) -> SensorCalibration:
     """Return a calibration with a new budget and covariance, and with effects that follow from it."""
-    complete = replace(calibration, covariance=covariance, freedom=freedom).parameters
+    complete = replace(fit, covariance=covariance, freedom=freedom).parameters
     known = freedom[complete.standard_uncertainty > 0.0]
     expanded, effects = iter(complete.expanded_uncertainty.tolist()[AFTER_BASE]), []
-    for one in calibration.effects:
+    for one in fit.effects:
         parameters = {n: replace(p, expanded_uncertainty=next(expanded) or None) for n, p in one.parameters.items()}
         effects.append(replace(one, parameters=parameters))
     return replace(
-        calibration,
+        fit,
         effects=tuple(effects),
         covariance=covariance,
         degrees_of_freedom=float(known.min()) if len(known) else float("inf"),

@@ -31,18 +31,7 @@ SINGLES = ("temperature", "table_angle", "table_rate", "flags")
 PARQUET_VERSION = 4
 ROW_GROUP = 1_000_000  # samples
 METADATA_KEY = b"recordings"
-COPIED_FIELDS = (
-    "name",
-    "role",
-    "axis",
-    "setup",
-    "kind",
-    "up",
-    "sense",
-    "source",
-    "filter",
-    "clock_shared",
-)  # fields stored as JSON
+COPIED_FIELDS = ("name", "role", "axis", "setup", "kind", "up", "sense", "source", "filter", "clock_shared")  # as JSON
 TYPES = {"time_ns": "int64", **dict.fromkeys(CHANNELS, "float64"), "flags": "uint16"}
 PAGE_ENCODINGS = {"int64": "DELTA_BINARY_PACKED", "float64": "PLAIN", "uint16": "PLAIN"}
 

@@ -272,9 +272,7 @@ def fit_clocks(sensor: Log, log: Log) -> ClockFit:
         hint = "do both logs belong to one recording, and are their units right?"
         raise IngestError(message, log.path, code="no_sync", hint=hint)
     if len(order) > 1 and residuals[order[1]] < AMBIGUOUS * residuals[order[0]]:
-        message = (
-            f"the motion repeats itself: the offsets {best:.3f} and {places[int(order[1])]:.3f} s fit equally well"
-        )
+        message = f"the motion repeats itself: the offsets {best:.3f} and {places[int(order[1])]:.3f} s fit as well"
         hint = "log the table during the whole recording, or begin and end it with a turn unlike the others"
         raise IngestError(message, log.path, code="no_sync", hint=hint)
     return fit

@@ -68,16 +68,14 @@ SIGNIFICANT_DEVIATIONS, CHI_SQUARE_TAIL = 6.0, 18.0
 LARGEST_SHARE = 0.1  # of the pieces
 
 
-def leave_out_disturbances(
-    recording: Recording, note: Callable[[str, Index, str], Note], largest_share: float
-) -> Recording:
+def leave_out_disturbances(recording: Recording, note: Callable[[str, Index, str], Note], most: float) -> Recording:
     """Remove the disturbed samples of a recording, and note them by ``note``, the method of its ``Log``.
 
-    If they are more than ``largest_share`` of the samples, none is removed, and that is noted: then the disturbance is
+    If they are more than ``most`` of the samples, none is removed, and that is noted: then the disturbance is
     a property of the bench.
     """
     silent = recording.accelerometer is None and recording.gyroscope is None
-    if silent or largest_share == 0 or recording.samples < 4 * FEWEST_AROUND:
+    if silent or most == 0 or recording.samples < 4 * FEWEST_AROUND:
         return recording
     excess, where = disturbed(recording)
     excess[~recording.valid] = 0.0  # no fit looks at them
@@ -92,9 +90,9 @@ def leave_out_disturbances(
         f"allow at {recording.time_ns[row] / 1e9:.9g} s"
     )
     places = f"{rows.size} sample{'s' * (rows.size > 1)} in {events} place{'s' * (events > 1)}"
-    if rows.size > largest_share * recording.samples:
+    if rows.size > most * recording.samples:
         detail = (
-            f"{places} look like glitches or knocks, more than the share of {largest_share:g} that "
+            f"{places} look like glitches or knocks, more than the share of {most:g} that "
             f"ingest.checks.disturbed_rows leaves out, so all are kept; does the bench vibrate, "
             f"or the log run on another clock? {worst}"
         )
@@ -189,9 +187,7 @@ class _Motion:
         changed = np.linalg.norm(np.diff(rate, axis=0), axis=1)
         speed = np.radians(np.linalg.norm(rate, axis=1))
         pulled = (np.radians(changed) / dt + np.abs(np.diff(speed**2))) * LEVER_M / STANDARD_GRAVITY
-        self.turned, self.changed, self.pulled = (
-            np.concatenate([[0.0], np.cumsum(v)]) for v in (turned, changed, pulled)
-        )
+        self.turned, self.changed, self.pulled = (np.append(0.0, np.cumsum(v)) for v in (turned, changed, pulled))
 
     def _rate(self) -> Values | None:
         """Return the rate: (n, 1) or (n, 3) array, deg/s; None if it is unknown."""

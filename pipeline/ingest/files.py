@@ -274,9 +274,7 @@ def _entry(row: Mapping[str, str], path: str, line: int) -> RecordingFile:
     kind, held_out, direction = row["kind"], row["held_out"].lower(), direction_of(row["axis"])
     turned = kind in {"turn", "table"}
     angle, accuracy = (_number(row[name]) for name in OF_TURNS[1:])
-    of_turns = [
-        (name, bool(row[name]) and not turned, f"nothing (it is of a turn, this is {kind})") for name in OF_TURNS
-    ]
+    of_turns = [(n, bool(row[n]) and not turned, f"nothing (it is of a turn, this is {kind})") for n in OF_TURNS]
     logged = kind == "table" and bool(row["angle_deg"])
     checks = [
         ("file", not row["file"], "the name of a file in this folder"),

@@ -22,24 +22,19 @@ tens of degrees.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imu_logs.clocks import bursts_error, rounded_error
+from imu_logs.log import Log
+from imu_logs.profile import Checks
 from imu_logs.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TABLE_CHANNELS, TRIADS
 from pipeline.core.errors import IngestError
 from pipeline.core.records import SENSOR_UNITS, Index, Integers, Mask, Note, Recording, Values, median
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from imu_logs.log import Log
-    from imu_logs.profile import Checks
-    from pipeline.core.settings import Sensor
+from pipeline.core.settings import Sensor
 
 GAP, CLIPPED, STUCK = np.uint16(1), np.uint16(2), np.uint16(4)  # bits of ``Recording.flags``
 GAP_INTERVALS = 1.5  # half way to one missing sample

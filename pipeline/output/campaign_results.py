@@ -23,14 +23,7 @@ from pipeline.core.pack import DOCUMENT_FOLDERS, read_published
 from pipeline.core.records import SENSORS
 from pipeline.output.pages.parameters import SUMMARY_COLUMNS, fitted_parameters, reading_errors
 
-COLUMNS_OF_PARAMETERS = (
-    "parameter",
-    "value",
-    "value_unit",
-    "expanded_uncertainty",
-    "coverage_factor",
-    "uncertainty_with_open",
-)
+OF_PARAMETER = ("parameter", "value", "value_unit", "expanded_uncertainty", "coverage_factor", "uncertainty_with_open")
 ERROR_COLUMNS = (
     "step", "rms_error", "mean_abs_error", "max_error", "min_error", "sum_abs_error", "change_percent",
     "vector_rms_error", "noise_floor", "vector_noise_floor",
@@ -44,13 +37,7 @@ CHIPS = ["board", "reference", "unit", "parameter", "value", "value_unit", "expa
 NOISE_COLUMNS = (
     "axis", "term", "value", "value_unit", "low", "high", "upper_limit", "correlation_time_s", "frequency_hz", "reason",
 )  # fmt: skip
-FIGURE_ENDINGS = (
-    "_before",
-    "_after",
-    "_floor",
-    "_answers",
-    "_over_noise",
-)  # endings of the columns of summary.csv that hold numbers
+FIGURE_ENDINGS = ("_before", "_after", "_floor", "_answers", "_over_noise")  # of columns of summary.csv with numbers
 
 
 @dataclass(frozen=True)
@@ -107,9 +94,7 @@ class CampaignResults:
         ``left_out`` (rows that no fit uses); ``incomplete`` (stages after the fit that failed, and why); and other
         columns of ``units.csv``.
         """
-        kinds = {name: "float" if name.endswith(FIGURE_ENDINGS) else "str" for name in SUMMARY_COLUMNS} | {
-            "pass": "boolean"
-        }
+        kinds = {n: "float" if n.endswith(FIGURE_ENDINGS) else "str" for n in SUMMARY_COLUMNS} | {"pass": "boolean"}
         table = pd.read_csv(self.folder / "summary.csv", dtype=kinds, keep_default_na=False, na_values=[""])
         texts = [column for column in table if pd.api.types.is_string_dtype(table[column])]
         table[texts] = table[texts].map(text_of_cell, na_action="ignore")
@@ -128,11 +113,11 @@ class CampaignResults:
         ``cross_axis_xy`` (what axis x reads of a truth along y).
         """
         rows = (
-            about | dict(zip(COLUMNS_OF_PARAMETERS, parameter, strict=True))
+            about | dict(zip(OF_PARAMETER, parameter, strict=True))
             for about, part in self._parts("calibration")
             for parameter in fitted_parameters(part) + reading_errors(part)
         )
-        return pd.DataFrame(rows, columns=["unit", "sensor", *COLUMNS_OF_PARAMETERS])
+        return pd.DataFrame(rows, columns=["unit", "sensor", *OF_PARAMETER])
 
     @cached_property
     def errors(self) -> pd.DataFrame:

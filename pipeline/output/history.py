@@ -70,9 +70,7 @@ def digest(value: Any) -> str:  # noqa: ANN401  (any JSON value)
 def flat(value: Any, above: str = "") -> dict[str, str]:  # noqa: ANN401  (any JSON value)
     """Flatten a section: return its values as texts, by dotted key."""
     if isinstance(value, dict) and (value or not above):
-        return {
-            k: v for key, below in value.items() for k, v in flat(below, f"{above}.{key}" if above else key).items()
-        }
+        return {k: v for key, part in value.items() for k, v in flat(part, f"{above}.{key}" if above else key).items()}
     text = value if isinstance(value, str) else json.dumps(value)
     return {
         above: text
@@ -172,14 +170,7 @@ def record(
         recorded = {key for entry in entries for key in entry.get("sections") or {}}
         needed = {key for state in changed.values() for key in (state.get("config") or {}).values()} - recorded
         new = {key: flat(section) for key, section in (sections or {}).items() if key in needed}
-        entry = {
-            "run": number,
-            "time": now,
-            "settings": dict(settings),
-            "units": changed,
-            "gone": gone,
-            "sections": new,
-        }
+        entry = {"run": number, "time": now, "settings": {**settings}, "units": changed, "gone": gone, "sections": new}
         write_json(results / HISTORY_FOLDER / f"{number:04d}.json", entry)
         entries.append(entry)
     return entries
@@ -203,9 +194,7 @@ def difference(before: JSON, after: JSON) -> StateChange:
     """Return the differences between two states of a unit."""
     fitted = [{s: (state.get(s) or {}).get("effects") or [] for s in SENSORS} for state in (before, after)]
     calibrated = [state.get("status") == "ok" for state in (before, after)]
-    added, removed = (
-        {s: [e for e in one[s] if e not in other[s]] for s in SENSORS} for one, other in (fitted[::-1], fitted)
-    )
+    added, removed = ({s: [e for e in a[s] if e not in b[s]] for s in SENSORS} for a, b in (fitted[::-1], fitted))
     if not all(calibrated):
         removed = {s: [] for s in SENSORS}
     old, new = (state.get("overrides") or {} for state in (before, after))

@@ -217,7 +217,7 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     lines += lines_of(_not_in_uncertainty(rows).items())
     for column, words in (("left_out", "left out"), ("incomplete", "not complete")):
         lines += shortened(
-            [f"{r['unit']}, {words}: {what}" for r in rows if (what := r.get(column))], NAMED_PER_LINE, "units"
+            [f"{r['unit']}, {words}: {w}" for r in rows if (w := r.get(column))], NAMED_PER_LINE, "units"
         )
     entries = read_history(results) if of_this_run else []
     if entries:
@@ -270,9 +270,7 @@ def _reasons(results: Path, units: Sequence[str]) -> list[str]:
                 groups = kinds.setdefault(kind, {})
                 if doubt:
                     groups.setdefault(f"{sensor}, {doubt}", []).append(unit)
-    return [
-        line for groups in kinds.values() for line in shortened(lines_of(groups.items()), NAMED_PER_LINE, "reasons")
-    ]
+    return [line for each in kinds.values() for line in shortened(lines_of(each.items()), NAMED_PER_LINE, "reasons")]
 
 
 def _not_in_uncertainty(rows: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:

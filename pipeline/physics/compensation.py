@@ -69,27 +69,14 @@ MIN_EXPORTED_TIME_S = 0.1
 WHAT_TO_DO = "take the file as the run published it, or calibrate the unit anew"
 
 _VECTOR = items(number, 3)
-_EFFECT = fields(
-    {
-        "name": text,
-        "parameters": each(fields({"value": number, "unit": or_none(text)}, ("value",), others=True)),
-        "definition": or_none(mapping),
-    },
-    ("name", "parameters"),
-)
+_PARAMETERS = each(fields({"value": number, "unit": or_none(text)}, ("value",), others=True))
+_OF_EFFECT = {"name": text, "parameters": _PARAMETERS, "definition": or_none(mapping)}
+_EFFECT = fields(_OF_EFFECT, ("name", "parameters"))
 _COVARIANCE = fields(
     {"parameters": items(text), "values": items(items(or_none(number)))}, ("parameters", "values"), others=True
 )
-_STAGE = fields(
-    {
-        "name": text,
-        "parameters": mapping,
-        "residual_rms": or_none(number),
-        "correction": or_none(mapping),
-        "details": mapping,
-    },
-    ("name", "parameters"),
-)
+_OF_STAGE = {"name": text, "parameters": mapping, "details": mapping}
+_STAGE = fields(_OF_STAGE | {"residual_rms": or_none(number), "correction": or_none(mapping)}, ("name", "parameters"))
 _TEMPERATURES = dict.fromkeys(("temperature_degc", "soaked_degc"), items(number, 2))
 _RANGE = fields({"specific_force_g": number, "angular_rate_dps": number, **_TEMPERATURES}, ())
 SMOOTHING_S = 3.0  # 30 samples of a thermometer at 10 Hz; a package warms up in minutes
@@ -99,29 +86,15 @@ OF_THE_PAST = {"specific_force_rate", "angular_acceleration", "direction"}
 
 
 def _sensor(unit: str) -> Check:
-    required = {
-        "unit": one_of(unit),
-        "bias": _VECTOR,
-        "matrix": items(_VECTOR, 3),
-        "covariance": _COVARIANCE,
-        "effects": items(_EFFECT),
-        "stages": items(_STAGE),
-        "converged": flag,
-        "degrees_of_freedom": or_none(number),
-    }
+    required = {"unit": one_of(unit), "bias": _VECTOR, "matrix": items(_VECTOR, 3), "covariance": _COVARIANCE}
+    required |= {"effects": items(_EFFECT), "stages": items(_STAGE), "converged": flag}
+    required |= {"degrees_of_freedom": or_none(number)}
     optional = {"effective_degrees_of_freedom": or_none(items(or_none(number)))}
     return fields({**required, **optional}, required, others=True)
 
 
-_DOCUMENT = fields(
-    {
-        "status": one_of("ok"),
-        "calibrated_range": _RANGE,
-        **{sensor: or_none(_sensor(unit)) for sensor, unit in SENSOR_UNITS.items()},
-    },
-    ("status", *SENSORS),
-    others=True,
-)
+_PARTS = {sensor: or_none(_sensor(unit)) for sensor, unit in SENSOR_UNITS.items()}
+_DOCUMENT = fields({"status": one_of("ok"), "calibrated_range": _RANGE, **_PARTS}, ("status", *SENSORS), others=True)
 
 
 def read_calibration(file: Path) -> dict[str, Any]:

@@ -247,9 +247,7 @@ def fields_used(sensor: str, effects: Iterable[FittedEffect]) -> set[str]:
         seen |= looked_at
         strange = sorted(looked_at - set(FIELDS_OF_SIGNALS))
         if strange:
-            raise ConfigurationError(
-                f"effect {fitted.name} needs {', '.join(strange)}, which a field log does not hold"
-            )
+            raise ConfigurationError(f"effect {fitted.name} needs {', '.join(strange)}, which no field log holds")
     return seen
 
 

@@ -105,16 +105,14 @@ Entry = dict[str, Any]
 LimitRow = tuple[str, float, float, str, float, float, str]
 
 
-def with_open(
-    sensor: str, calibration: SensorCalibration, hidden: Mapping[str, Mapping[str, str] | None]
-) -> dict[str, Any]:
+def with_open(sensor: str, fit: SensorCalibration, hidden: Mapping[str, Mapping[str, str] | None]) -> dict[str, Any]:
     """Return ``open`` and ``uncertainty_with_open`` of a sensor's part of ``calibrations/<unit>.json``.
 
     ``hidden``: of each sensor, the effects that are not observable with their reasons; None where the diagnosis failed.
     """
-    parameters = calibration.parameters
+    parameters = fit.parameters
     U, k = (values[BASE] for values in (parameters.expanded_uncertainty, parameters.coverage_factor))
-    found = list(_open(sensor, calibration, hidden, U))
+    found = list(_open(sensor, fit, hidden, U))
     u_open = np.sqrt((U / k) ** 2 + sum((a**2 / 3.0 for _, a, _ in found), np.zeros(len(U))))
     return {
         "open": [{"effect": name, "up_to": _shaped(a), "reason": reason} for name, a, reason in found],

@@ -498,9 +498,7 @@ def _units_of_entry(entry: UnitDescription) -> list[UnitDescription]:
     digits = max(3, len(str(entry.count)))
     names = [f"{entry.unit}{number:0{digits}d}" for number in range(1, entry.count + 1)]
     lots = [{"serial": name, "lot": f"L{k // UNITS_OF_A_LOT + 1}"} for k, name in enumerate(names)]
-    return [
-        replace(entry, unit=name, count=1, columns=lot | entry.columns) for name, lot in zip(names, lots, strict=True)
-    ]
+    return [replace(entry, unit=n, count=1, columns=lot | entry.columns) for n, lot in zip(names, lots, strict=True)]
 
 
 def add_recording_options(parser: argparse.ArgumentParser) -> None:

@@ -247,12 +247,10 @@ def drawn_sensors(
             known = ", ".join(sorted(SENSOR_KEYS | NOISE_KEYS))
             raise ConfigurationError(f"{sensor}: {', '.join(unknown)} is not known; known: {known}")
         noise = {key: given[sensor][key] for key in NOISE_KEYS & set(given[sensor])}
-        data_sheet = sensor_model.of(sensor).replaced(**noise)
+        sheet = sensor_model.of(sensor).replaced(**noise)
         of_sensor = {name: hidden for name, hidden in effects[sensor].items() if name not in ALTERATIONS}
-        bias = np.array(given[sensor].get("bias", _limited(data_sheet.bias, rng)), float)
-        out[sensor] = SimulatedSensor(
-            sensor, data_sheet, bias, _matrix(data_sheet, given[sensor], mounting, rng), of_sensor
-        )
+        bias = np.array(given[sensor].get("bias", _limited(sheet.bias, rng)), float)
+        out[sensor] = SimulatedSensor(sensor, sheet, bias, _matrix(sheet, given[sensor], mounting, rng), of_sensor)
     return out
 
 
@@ -277,15 +275,13 @@ def _limited(limit: float, rng: np.random.Generator) -> Values:
     return np.clip(rng.standard_normal(3) * limit / 3.0, -limit, limit)
 
 
-def drawn_effects(
-    specification: Mapping[str, Any], sensor_model: Sensor, rng: np.random.Generator
-) -> dict[str, Hidden]:
+def drawn_effects(stated: Mapping[str, Any], sensor_model: Sensor, rng: np.random.Generator) -> dict[str, Hidden]:
     """Return the effects that a description's ``effects`` hide in each sensor.
 
     Raises ``ConfigurationError`` if an effect does not exist or apply, or its formula or number of values is wrong.
     """
     out: dict[str, Hidden] = {sensor: {} for sensor in SENSORS}
-    for key, value in specification.items():
+    for key, value in stated.items():
         sensor, _, name = str(key).rpartition(".")
         if isinstance(value, dict):
             usual = {"owner": "table", "sensors": [sensor] if sensor else list(SENSORS), "meaning": "Hidden."}

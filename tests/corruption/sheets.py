@@ -306,13 +306,13 @@ def _outcomes(made: Recorded) -> list[Outcome]:
     overrides = ["table.seat_deg=null"] if table != "hand" else []
     chosen = {"sensor": "mpu6050", "table": table, "procedure": "listed", "method": None}
     try:
-        tried = try_unit(unit_without_campaign(made.unit.folder, chosen, overrides, ()), "calibration")
+        state, failure = try_unit(unit_without_campaign(made.unit.folder, chosen, overrides, ()), "calibration")
     except PipelineError as error:
         return [(REFUSED, error.message)]
-    if tried.failure:
-        assert tried.failure["code"] != "internal_error", tried.failure
-        return [(REFUSED, f"{tried.failure['code']}: {tried.failure['message']}")]
-    document, diagnosis = tried.state.calibration, tried.state.diagnosis
+    if failure:
+        assert failure["code"] != "internal_error", failure
+        return [(REFUSED, f"{failure['code']}: {failure['message']}")]
+    document, diagnosis = state.calibration, state.diagnosis
     assert document is not None
     assert diagnosis is not None
     logged = [sensor for sensor in COLUMNS if made.named(COLUMNS[sensor][0])]

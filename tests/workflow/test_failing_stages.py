@@ -287,7 +287,7 @@ def test_other_failures_are_named_too(tmp_path: Path, simulated: Path) -> None:
     assert "does not show a sinusoid" in failures[2]["message"]
     page, index = (campaign.results / name for name in ("reports/in_stages.html", "index.html"))
     assert all("does not show a sinusoid" in file.read_text() for file in (page, index))
-    assert try_unit(unit_of_campaign(campaign, "in_stages"), "calibration").failure == failures[2]
+    assert try_unit(unit_of_campaign(campaign, "in_stages"), "calibration")[1] == failures[2]
     assert json.loads((campaign.results / "calibrations" / "good.json").read_text())["status"] == "ok"
 
 

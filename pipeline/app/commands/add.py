@@ -91,9 +91,8 @@ def edit_effects(
         wanted = list(now)
         for name in (name for s, name in effects if s == sensor):
             if not remove:
-                changes.append(
-                    f"unit {unit}: {f'{key} has {name} already' if name in now else f'{name} added to {key}'}"
-                )
+                done = f"{key} has {name} already" if name in now else f"{name} added to {key}"
+                changes.append(f"unit {unit}: {done}")
                 wanted += [name] * (name not in wanted)
             elif name in now:
                 changes.append(f"unit {unit}: {name} removed from {key}")
@@ -322,12 +321,8 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
     before = {unit: _published(results, unit) for unit in effects_of}
     code = run_snakemake(arguments, arguments.config)
     own = changes_of(results, list(effects_of)) if code == 0 else []
-    print(
-        "\n".join(
-            shortened(own, NAMED_PER_LINE, "sensors that changed")
-            or ["no sensor of these units has another error"] * (code == 0)
-        )
-    )
+    told = shortened(own, NAMED_PER_LINE, "sensors that changed")
+    print("\n".join(told or ["no sensor of these units has another error"] * (code == 0)))
     after = {unit: _published(results, unit) for unit in effects_of} if code == 0 else {}
     lines = [line for unit, now in after.items() for line in changed_files(unit, before[unit], now)]
     print("".join(f"{line}\n" for line in shortened(lines, NAMED_PER_LINE, "changes of files")), end="")

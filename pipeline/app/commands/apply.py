@@ -51,14 +51,10 @@ def main(argv: Sequence[str]) -> int:
     compensation = load(arguments.calibration, arguments.python_effects)
     for log in arguments.logs:
         require_apart(log, arguments.output)
-    if (
-        arguments.output.exists()
-        and arguments.calibration.exists()
-        and arguments.output.samefile(arguments.calibration)
-    ):
-        message = "the output would overwrite the calibration; choose another file for -o"
-        raise InputError(message, str(arguments.output))
-    profile = _profile(arguments.calibration, arguments.ingest, arguments.logs[0])
+    calibration, output = arguments.calibration, arguments.output
+    if output.exists() and calibration.exists() and output.samefile(calibration):
+        raise InputError("the output would overwrite the calibration; choose another file for -o", str(output))
+    profile = _profile(calibration, arguments.ingest, arguments.logs[0])
     log, *joined = _files(arguments.logs, profile)
     countdown = Countdown(log.stat().st_size if log.is_file() else 0)
     result = compensate_log(
@@ -96,13 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     words = f"the log: .mcap, {', '.join(MESSAGE_FORMATS)}, or text; several files only if the profile joins them"
     add("logs", type=Path, nargs="+", metavar="LOG", help=words)
-    add(
-        "--calibration",
-        type=Path,
-        required=True,
-        metavar="C.json",
-        help="calibration of the unit: calibrations/<unit>.json",
-    )
+    add("--calibration", type=Path, required=True, metavar="C.json", help="calibrations/<unit>.json of the unit")
     words = "file to write: MCAP for an MCAP log, else CSV; - for the standard output"
     add("-o", "--output", type=Path, required=True, metavar="OUT", help=words)
     words = "MCAP: topic of the calibrated messages (default: topic of the readings with the suffix _calibrated)"

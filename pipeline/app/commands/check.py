@@ -202,11 +202,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = parser_of("check", __doc__, EPILOG, ("--ingest", "--sensor", "--range"))
     add = parser.add_argument
     add("files", type=Path, nargs="*", metavar="FILE", help=f"a text log, or {', '.join(SUFFIXES[1:-1])}")
-    add(
-        "--campaign",
-        metavar="CAMPAIGN",
-        help="a campaign's name or directory: its settings, or without files its units",
-    )
+    add("--campaign", metavar="CAMPAIGN", help="a campaign's name or directory: settings, or without files its units")
     add("--unit", metavar="UNIT", help="this unit of the campaign alone")
     add("--save", type=Path, metavar="FILE", help="write the proposed profile to this file")
     return parser
@@ -236,9 +232,7 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Outcome]]]:
             )
         chosen, others = recordings_of_files(files, campaign, known) if files else ({unit: [] for unit in known}, [])
         saved = SavedProfiles(directory)
-        checks = {
-            f"unit {unit}": partial(_check_unit, unit=unit, names=names, saved=saved) for unit, names in chosen.items()
-        }
+        checks = {f"unit {u}": partial(_check_unit, unit=u, names=names, saved=saved) for u, names in chosen.items()}
         for log in _logs_of_campaign(others, campaign, known) if others else []:
             checks[str(log.files[0])] = partial(_check_log_of_campaign, files=log.files, units=known)
         tasks += [(what, partial(_check_or_saved, check, campaign, saved)) for what, check in checks.items()]
@@ -326,13 +320,11 @@ def _check_log_of_campaign(campaign: Campaign, files: Sequence[Path], units: Seq
 def _check_unit(campaign: Campaign, unit: str, names: Sequence[str], saved: SavedProfiles) -> Outcome:
     """Return the result of a run for a unit: content and notes of the named recordings, or a summary of all."""
     configured, missing = unit_of_campaign(campaign, unit), ""
-    trial = try_unit(configured, "fit", fits=False) if names else try_unit(configured, "calibration")
-    if names and trial.failure and trial.failure["code"] == "missing_file":
-        missing = (
-            f"a run needs more recordings of unit {unit}; they are not compared before: {trial.failure['message']}"
-        )
-        trial = try_unit(configured.with_missing(), "ingest")
-    checked = trial.state.checked or []
+    state, failure = try_unit(configured, "fit", fits=False) if names else try_unit(configured, "calibration")
+    if names and failure and failure["code"] == "missing_file":
+        missing = f"a run needs more recordings of unit {unit}; without them none is compared: {failure['message']}"
+        state, failure = try_unit(configured.with_missing(), "ingest")
+    checked = state.checked or []
     read = _readings_of(campaign, unit)
     texts = []
     refused: list[Refused] = []
@@ -344,15 +336,15 @@ def _check_unit(campaign: Campaign, unit: str, names: Sequence[str], saved: Save
             outcome = _refusal_of(read[name], error)
             texts.append(outcome.text)
             refused += outcome.refused
-    if trial.failure and (not refused or trial.failure["code"] == "missing_file"):
-        place = trial.failure["file"] or f"unit {unit}"
-        refused.append(Refused(trial.failure["code"], trial.failure["message"], place))
-        file = [("file", trial.failure["file"])] if trial.failure["file"] else []
-        lines = [*file, ("REFUSED", trial.failure["message"]), ("code", trial.failure["code"])]
+    if failure and (not refused or failure["code"] == "missing_file"):
+        place = failure["file"] or f"unit {unit}"
+        refused.append(Refused(failure["code"], failure["message"], place))
+        file = [("file", failure["file"])] if failure["file"] else []
+        lines = [*file, ("REFUSED", failure["message"]), ("code", failure["code"])]
         texts.append(f"unit {unit} of campaign {campaign.name}\n{as_text(lines)}")
         texts += _sheet_proposed(campaign, unit, saved)
     elif not names and not refused:
-        document = trial.state.calibration or {}
+        document = state.calibration or {}
         lines = [(sensor, f"null: {reason}") for sensor, reason in document["not_calibrated"].items()]
         lines += [(s, text) for s in SENSORS if document[s] and (text := document[s]["not_determined"])]
         by_hand = [r for r in checked if r.role == "rests" and r.kind in BY_HAND and r.logged_rate is None]

@@ -213,9 +213,7 @@ def explain(
     settings, results = _settings(folder), str(folder.parent)
     units: list[JSON] = []
     for unit, document in diagnoses.items():
-        validation, calibration = (
-            _json(folder / kind / f"{unit}.json") or {} for kind in ("validations", "calibrations")
-        )
+        validation, calibration = (_json(folder / of / f"{unit}.json") or {} for of in ("validations", "calibrations"))
         name = document.get("unit", unit)
         places = {s: place(part["verdict"]) if (part := document.get(s)) else len(Verdict) + 1 for s in SENSORS}
         ordered = sorted(SENSORS, key=places.__getitem__)  # first what can be added and what is in doubt

@@ -68,13 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     words = "take sensor, table and procedure from the description of a simulation"
     add("--from", dest="source", type=Path, default=None, metavar="FILE", help=words)
-    add(
-        "--campaign",
-        type=Path,
-        default=None,
-        metavar="DIR",
-        help=f"likewise, from the description DIR/{DESCRIPTION_FILE}",
-    )
+    add("--campaign", type=Path, default=None, metavar="DIR", help=f"likewise, by DIR/{DESCRIPTION_FILE}")
     add("--unit", default=None, metavar="NAME", help="a unit of the description (default: the first)")
     add("--effect", dest="effects", action="append", type=Path, default=[], metavar="FILE",
         help="an effect of your own (YAML); those of the campaign are always included")  # fmt: skip

@@ -50,9 +50,7 @@ def main(argv: Sequence[str]) -> int:
     finish_publishing(results)
     batches = batches_of(results)
     if absent := [unit for unit in units if unit not in batches]:
-        raise MissingInputError(
-            f"no unit {', '.join(absent)}; there are {', '.join(sorted(batches)[:12])}", str(results)
-        )
+        raise MissingInputError(f"no unit {', '.join(absent)}; known: {', '.join(sorted(batches)[:12])}", str(results))
     again, new, index = repetitions(results, "")[0], results / NEW_FOLDER, results / "index.html"
     shutil.rmtree(new, ignore_errors=True)
     paths = []

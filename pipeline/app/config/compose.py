@@ -105,10 +105,8 @@ class Composer:
         if key not in self._resolved:
             self._resolved[key] = self._resolve(groups, values)
         resolved = self._resolved[key]
-        procedure = resolved.procedure
-        unit = resolved.replaced(
-            unit=name, procedure=procedure.replaced(folder=procedure.folder.replace("{unit}", name))
-        )
+        folder = resolved.procedure.folder.replace("{unit}", name)
+        unit = resolved.replaced(unit=name, procedure=resolved.procedure.replaced(folder=folder))
         unit = with_sheet(unit, self.below / unit.procedure.folder)
         return with_given(unit, self.below) if GIVEN in (unit.method.accelerometer, unit.method.gyroscope) else unit
 
@@ -123,15 +121,11 @@ class Composer:
                     raise SettingProblem(f"{key}={value}: no such {key}{nearest(value, self.options[key])}")
                 groups[key] = value
             elif key in RUN_SETTINGS:
-                raise SettingProblem(
-                    f"{text}: {key} is a setting of the run, not of a unit; set it in campaign.yaml or overrides="
-                )
+                raise SettingProblem(f"{text}: {key} is a setting of the run, not of a unit; set it in campaign.yaml")
             elif key == PYTHON:
                 raise SettingProblem(f"{text}: {ONLY_FROM_THE_COMMAND_LINE}")
             elif key.startswith("method.stages"):
-                raise SettingProblem(
-                    f"{text}: stages are what a method is; write a method of your own in configs/method/"
-                )
+                raise SettingProblem(f"{text}: stages are what a method is; write your own method in configs/method/")
             else:
                 values.append((key, value))
         sensor = self._read("sensor", groups.get("sensor") or default_option("sensor"))
@@ -277,9 +271,7 @@ class Composer:
                 user_effect = self.user_effects.effects.get(name)
                 contains = user_effect.contains if user_effect else read_option("effect", name, ()).get("contains", [])
                 if within := [other for other in names if other in contains]:
-                    raise SettingProblem(
-                        f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them"
-                    )
+                    raise SettingProblem(f"effects.{sensor} names {name} and {within[0]}, which it contains: name one")
         ingest = repr((settings.ingest, settings.procedure))
         if ingest not in self._valid_ingest:
             check_ingest(settings.ingest, settings.procedure)

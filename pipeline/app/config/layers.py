@@ -55,11 +55,8 @@ DEVICES_FOLDER = "devices"
 BETWEEN_OVERRIDES = re.compile(r';(?=(?:[^"]*"[^"]*")*[^"]*$)')  # a semicolon outside double quotes
 SIMULATION = "simulation.yaml"
 LIST = "a list of overrides KEY=VALUE"
-Overrides = Annotated[
-    list[str],
-    BeforeValidator(lambda value: [value] if isinstance(value, str) else value or []),
-    Field(description=LIST),
-]
+OneOrMore = BeforeValidator(lambda value: [value] if isinstance(value, str) else value or [])
+Overrides = Annotated[list[str], OneOrMore, Field(description=LIST)]
 ByName = Annotated[
     dict[Annotated[str, BeforeValidator(str)], Overrides],
     BeforeValidator(lambda value: value or {}),
@@ -164,9 +161,7 @@ class CampaignFile(DeviceFile):
 
     models: ByName = {}
     lots: ByName = {}
-    compare: Annotated[
-        list[Any], BeforeValidator(lambda value: value or []), Field(description="a list of comparisons")
-    ] = []
+    compare: Annotated[list[Any], BeforeValidator(lambda v: v or []), Field(description="a list of comparisons")] = []
     simulate: bool = Field(default=False, description="true or false")
     page: Literal["thesis"] | None = Field(default=None, description="thesis (python -m pipeline thesis page)")
 
@@ -229,9 +224,7 @@ def load_layers(directory: Path, settings: Mapping[str, Any], sensors: Iterable[
     on_command_line, command = _split(as_list(settings.get("overrides", []), "overrides"))
     simulation = path.with_name(SIMULATION) if file.simulate else None
     if simulation and not os.path.lexists(simulation):
-        raise ConfigurationError(
-            f"simulate: true needs {SIMULATION} in the same folder, which does not exist", str(path)
-        )
+        raise ConfigurationError(f"simulate: true needs {SIMULATION} in the same folder, which is absent", str(path))
     problem = not_regular(simulation) if simulation else None
     if problem:
         raise ConfigurationError(problem, str(simulation))

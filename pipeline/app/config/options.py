@@ -34,9 +34,7 @@ GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certifi
 RUN_SETTINGS = tuple(RunSettings.model_fields)
 LARGEST_CONFIG = 10_000  # values of an option; the largest in configs/ has 160
 NUMBER_OVERRIDE = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
-WORD_OVERRIDE = re.compile(
-    r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=([A-Za-z_][A-Za-z_0-9./-]*)"
-)  # a text or a path
+WORD_OVERRIDE = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=([A-Za-z_][A-Za-z_0-9./-]*)")  # text, path
 NOT_TEXTS = ("null", "true", "false", "nan", "inf")
 REFERENCE_TOKEN = re.compile(r"(\\\$\{)|\$\{\s*([A-Za-z_]\w*(?:\.\w+)+)\s*\}|\$\{")
 MAX_REFERENCE_LENGTH = 10_000  # characters of a value with references, such as a name or a unit
@@ -85,9 +83,7 @@ def parse(text: str) -> tuple[str, Any]:
     except (OverrideParseException, HydraException) as error:
         raise SettingProblem(f"{text!r} is not a Hydra override ({str(error).splitlines()[0]}){hint}") from error
     if override.is_sweep_override() or override.is_delete():
-        raise SettingProblem(
-            f"{text!r} is a {'sweep' if override.is_sweep_override() else 'deletion'}; give one value{hint}"
-        )
+        raise SettingProblem(f"{text!r} is a sweep or a deletion; give one value{hint}")
     return override.key_or_group, override.value()
 
 
@@ -139,9 +135,7 @@ def check_references(value: Any, where: str | None = None) -> None:  # noqa: ANN
         for below in value:
             check_references(below, where)
     elif isinstance(value, str) and any(not escaped and not name for escaped, name in REFERENCE_TOKEN.findall(value)):
-        raise ConfigurationError(
-            f"{value[:200]!r}: {REFERENCE_FORM}; resolvers such as ${{oc.env:NAME}} are not read", where
-        )
+        raise ConfigurationError(f"{value[:200]!r}: {REFERENCE_FORM}; resolvers (${{oc.env:NAME}}) are not read", where)
 
 
 def with_references(node: Any, root: dict[str, Any]) -> Any:  # noqa: ANN401  (dict, list or value)
@@ -167,9 +161,7 @@ def with_references(node: Any, root: dict[str, Any]) -> Any:  # noqa: ANN401  (d
         text += node[end : token.start()] + ("${" if token.group(1) else str(value))
         end = token.end()
         if len(text) > MAX_REFERENCE_LENGTH:
-            raise ConfigurationError(
-                f"{node[:200]!r}: has more than {MAX_REFERENCE_LENGTH} characters with its references"
-            )
+            raise ConfigurationError(f"{node[:200]!r}: more than {MAX_REFERENCE_LENGTH} characters with its references")
     return text + node[end:]
 
 
@@ -297,13 +289,9 @@ def with_given(settings: Settings, campaign: Path) -> Settings:
 
     method, effects = settings.method, {sensor: settings.effects.of(sensor) for sensor in SENSORS}
     if not method.file:
-        raise SettingProblem(
-            "method=given: method.file is not set; name the calibration, in any format of docs/apply.md"
-        )
+        raise SettingProblem("method=given: method.file is not set; name the calibration, in a format of docs/apply.md")
     if stated := [f"table.{key}" for key in OF_BENCH if getattr(settings.table, key)]:
-        raise SettingProblem(
-            f"method=given: {stated[0]} is set, which a fit would estimate; nothing is fitted: set it null"
-        )
+        raise SettingProblem(f"method=given: {stated[0]} is set, which only a fit estimates: set it null")
     file = campaign / method.file.replace("{unit}", settings.unit)
     try:
         content = read_any(file, method.format, {s: settings.sensor.of(s).counts_per_unit for s in SENSORS})

@@ -204,9 +204,7 @@ def _move_all(campaign: Campaign) -> Path | None:
         if is_owner(results, campaign.directory):  # another process has moved them
             return None
         finish_publishing(results)
-        names = [
-            name for name in (*PUBLISHED_PATHS, *BESIDE, NEW_FOLDER, OWNER_FILE) if os.path.lexists(results / name)
-        ]
+        names = [n for n in (*PUBLISHED_PATHS, *BESIDE, NEW_FOLDER, OWNER_FILE) if os.path.lexists(results / n)]
         return set_aside({name: results / name for name in names}, results)
     finally:
         OPEN_LOCKS.pop().close()

@@ -16,19 +16,14 @@ fewer digits, programs that write doubles give more.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from imu_logs.units import FORCE_UNITS
 from pipeline.core.errors import InputError
 from pipeline.core.records import SENSORS, Mask, Values
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    import pyarrow as pa
-
 
 DECIMALS = 12  # in the output of ``apply``: far below the resolution of sensors, above the rounding of a double
 TEMPERATURE_RANGE, SOAKED = "temperature_degc", "soaked_degc"  # of ``calibrated_range``
@@ -38,7 +33,7 @@ RANGES = {"accelerometer": "specific_force_g", "gyroscope": "angular_rate_dps"} 
 RANGE_MARGIN, MARGIN_DEGC = 0.1, 1.0  # share of the largest magnitude; degC
 WINDOW_SAMPLES = 100  # samples: 0.1 to 1 s at usual rates
 MOST_WINDOWS = 20_000  # 2 million samples, 6 MB: limits the memory
-QUIET_SCATTER_RATIO, QUIET_WINDOW_SHARE = 2.0, 0.1  # ratio of scatters, and share of the windows; see above
+QUIET_RATIO, QUIET_SHARE = 2.0, 0.1  # ratio of scatters, and share of the windows; see above
 FEWEST_RESTS = 3  # directions of gravity, for three axes
 DIRECTED = 0.1  # scatter over mean of a rest's specific force: its direction is known to 0.1 / sqrt(100) rad = 0.6 deg
 # Largest ratio of the errors after and before. If a drift is as large as the bias, with three components each, a ratio
@@ -94,7 +89,7 @@ class LogChecks:
             )
             raise InputError(f"{message}, {self.soaked[0]:.1f} to {self.soaked[1]:.1f} degC", file)
 
-    def check_decimals(self, columns: Sequence[pa.Array], decimal: str) -> None:
+    def check_decimals(self, columns: Sequence[Any], decimal: str) -> None:
         """Check whether the readings of a text log have the decimals that ``apply`` writes."""
         cells = [str(cell) for column in columns for cell in column[:CELLS].to_pylist()]
         decimals = [cell.partition(decimal)[2] for cell in cells if "e" not in cell.lower()]
@@ -229,9 +224,7 @@ class LogChecks:
         still = np.ones(len(table[present[0]]), bool)
         for sensor in present:
             scatter = table[f"{sensor} scatter"]
-            still &= scatter <= QUIET_SCATTER_RATIO * np.minimum(
-                np.quantile(scatter, QUIET_WINDOW_SHARE), table[f"{sensor} noise"]
-            )
+            still &= scatter <= QUIET_RATIO * np.minimum(np.quantile(scatter, QUIET_SHARE), table[f"{sensor} noise"])
         if "accelerometer" in table:
             size = np.linalg.norm(table["accelerometer"], axis=1)
             still &= table["accelerometer scatter"] < DIRECTED * size
@@ -281,9 +274,7 @@ class LogChecks:
         if turned == 0.0 or integral > turned / 2.0:
             return []
         cause = "rad/s" if abs(np.degrees(integral) / turned - 1.0) < 1.0 else "another unit or range"
-        angles = (
-            f"gravity turns by {turned:.3g} deg between rests, over which the gyroscope integrates to {integral:.3g}"
-        )
+        angles = f"gravity turns by {turned:.3g} deg between rests, where the gyroscope integrates to {integral:.3g}"
         return [f"{angles} deg: its readings look like {cause}; --ingest names a profile with the unit of each column"]
 
 

@@ -125,9 +125,7 @@ class CalibratedStretch:
         rests = [r for r in find_rests(log) if r.accepted]
         if not rests:
             message = f"no rest of 1 s or more from {self.first:g} to {self.last:g} s of the log"
-            raise InputError(
-                f"{message}; --rest states an interval with a rest, in s from the first sample of the log", file
-            )
+            raise InputError(f"{message}; --rest states an interval with a rest, s from the first sample", file)
         longest = max(rests, key=lambda r: r.stop - r.start)
         still = rate[longest.start : longest.stop]
         mean = still.mean(axis=0)

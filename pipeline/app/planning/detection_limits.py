@@ -259,10 +259,8 @@ class RestLimits(DetectionLimits):
         self.hypothesis = int(np.argmax(np.mean(without_effects, axis=1)))
         self.factors = []  # on the gain of each candidate
         for j in range(len(terms)):
-            shown, constants = self.projected.count(j, self.hypothesis), int(self._fixed(j).sum())
-            factor = (
-                self.projected.correction(j, self.hypothesis, shown + constants, equations.scatter) if shown else 0.0
-            )
+            shown, fixed = self.projected.count(j, self.hypothesis), int(self._fixed(j).sum())
+            factor = self.projected.correction(j, self.hypothesis, shown + fixed, equations.scatter) if shown else 0.0
             self.factors.append(factor)
         self._of_draws = [self._along(j, self.drawn) for j in range(len(terms))]
 

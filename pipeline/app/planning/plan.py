@@ -69,7 +69,7 @@ FAULTLESS: dict[str, Any] = {"angle_accuracy_deg": 0.0, "rate_error": [0.0] * 3,
 Document = dict[str, Any]
 FASTER_DPS = (100.0, 200.0)  # proposed rates, within a low-cost range of 250 deg/s
 CLEARLY_FASTER = 1.3  # least proposed rate over the procedure's fastest rate
-USABLE_RANGE_SHARE = 0.9  # of the gyroscope's full scale: its bias needs the remainder
+USABLE_SHARE = 0.9  # of the gyroscope's full scale: its bias needs the remainder
 MOTION_S, MOTION_DPS = 120.0, 100.0  # of the proposed random motion
 UPRIGHT_DPS = 60.0  # one turn about an upright z in 6 s
 LONG_REST_S = 600.0  # six correlation times of a typical wander (configs/sensor)
@@ -174,9 +174,7 @@ def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Select
 def _entry(sensor: str, detection: Detection, *, limited: bool) -> Document:
     parameters = effect(detection.effect).parameters(sensor)
     first = float(detection.unit_sizes[0])
-    almost_sure, named = (
-        share * first if np.isfinite(share * first) else None for share in (detection.sure, detection.named)
-    )
+    almost_sure, named = (s * first if np.isfinite(s * first) else None for s in (detection.sure, detection.named))
     return {
         "effect": detection.effect,
         "smallest": detection.found * first,
@@ -213,9 +211,7 @@ def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> 
 
     Raises ``ConfigurationError`` if sensor, table or procedure are unknown, or the course is impossible.
     """
-    faultless = replace(
-        unit, effects={}, imperfections=FAULTLESS, held_out={}, temperature={**ROOM, **unit.temperature}
-    )
+    faultless = replace(unit, effects={}, imperfections=FAULTLESS, held_out={}, temperature=ROOM | unit.temperature)
     recordings, _ = simulate_unit(faultless, SEED, 0, extra)
     settings = shipped_settings(sensor=unit.sensor, table=unit.table, procedure=unit.procedure)
     if sheet := sheet_of(unit):
@@ -350,9 +346,7 @@ def changes(unit: UnitDescription) -> list[ProcedureChange]:
 
     if on_table and not course.both_directions:
         propose("make every turn in the other direction too", "--both-directions", both_directions=True)
-    faster = [
-        r for r in FASTER_DPS * on_table if CLEARLY_FASTER * max(course.rates_dps) < r <= USABLE_RANGE_SHARE * full
-    ]
+    faster = [r for r in FASTER_DPS * on_table if CLEARLY_FASTER * max(course.rates_dps) < r <= USABLE_SHARE * full]
     if faster:
         rates = (*course.rates_dps, *faster)
         what = f"turn at {' and '.join(f'{r:g}' for r in faster)} deg/s too, both sensors recorded"
@@ -387,7 +381,7 @@ def _further(unit: UnitDescription, course: Course, full: float) -> Iterator[Pro
     yield ProcedureChange("run the whole procedure a second time, once the unit is warm", "", unit, repeated)
     if unit.table == "single_axis":
         return
-    rate = min(MOTION_DPS, USABLE_RANGE_SHARE * full)
+    rate = min(MOTION_DPS, USABLE_SHARE * full)
     motion = random_gimbals(MOTION_S, rate, np.random.default_rng(0))
     what = f"random motion about all axes up to {rate:g} deg/s for {MOTION_S / 60.0:g} min, attitude logged, in the fit"
     yield ProcedureChange(what, "", unit, (Planned("motion", "gyroscope", None, motion),))

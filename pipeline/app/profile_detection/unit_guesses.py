@@ -8,9 +8,10 @@ encoder        : gravity turns with the table, f = c + a cos(2 pi n / N) + b sin
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -30,17 +31,13 @@ from imu_logs.guesses import (
     rate_by_size,
     unit_of_turn,
 )
+from imu_logs.proposal import Proposal
 from imu_logs.units import COUNTS, DEGREES, FORCE_UNITS, UNITS
 from imu_logs.yaml_file import read_yaml
 from pipeline.core.files import CONFIGS
+from pipeline.core.records import Values
+from pipeline.core.settings import Sensor
 from pipeline.ingest.quality_flags import MoveByHand, interval_of, misfit_deg, moves_of, rests_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from imu_logs.proposal import Proposal
-    from pipeline.core.records import Values
-    from pipeline.core.settings import Sensor
 
 CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and misalignment on the table
 SLOWEST = 1.0  # deg/s rms of a table: below, noise and bias wander are larger

@@ -9,8 +9,9 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
@@ -22,6 +23,7 @@ from pipeline.app.results_folder import (
     published_units,
     record_units,
 )
+from pipeline.app.steps.batch import Job
 from pipeline.app.steps.summary import failed_files, failed_summary
 from pipeline.core import VERSION
 from pipeline.core.errors import PipelineError, failure_of
@@ -42,11 +44,6 @@ from pipeline.output.pages.fleet import (
     write_summary,
 )
 from pipeline.output.pages.parameters import Parameter
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from pipeline.app.steps.batch import Job
 
 
 def gather_batch(job: Job) -> None:

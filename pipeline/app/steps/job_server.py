@@ -76,17 +76,10 @@ def _prepare() -> None:
     """Import the modules of the stages, read the built-in effects and the compiled templates."""
     from importlib import import_module  # noqa: PLC0415
 
-    for module in {*MODULES.values()} - {"gather"}:  # runs once, and imports pandas
+    for module in {"unit_files", *MODULES.values()} - {"gather"}:  # runs once, and imports pandas
         import_module(f"pipeline.app.steps.{module}")
-    for module in (
-        "pipeline.app.steps.unit_files",
-        "scipy.interpolate",
-        "scipy.spatial.transform",
-        "imufusion",
-        "imu_logs.text_read",
-        "encodings.cp437",
-    ):
-        import_module(module)  # stages import them inside functions
+    for name in ("scipy.interpolate", "scipy.spatial.transform", "imufusion", "imu_logs.text_read", "encodings.cp437"):
+        import_module(name)  # stages import them inside functions
 
     from pipeline.core.files import use_cache  # noqa: PLC0415
     from pipeline.evaluation.diagnosis import words  # noqa: PLC0415

@@ -61,11 +61,9 @@ from pipeline.core.records import (
     AXES,
     BASE,
     BASE_COUNT,
-    Coefficient,
     Contribution,
     Convergence,
     CorrectionStep,
-    FittedEffect,
     Recording,
     SensorCalibration,
     StageResult,
@@ -87,7 +85,7 @@ from pipeline.estimation.uncertainty_budget import (
     scatter_contribution,
     stage_parameters,
 )
-from pipeline.physics.effects import effect
+from pipeline.physics.effects import fitted_effect
 
 PHASE_ITERATIONS = 12  # of the phase
 SAME_PHASE = 1e-12  # rad
@@ -278,9 +276,7 @@ def _per_axis(name: str, values: Values, unit: str) -> NamedValues:
 
 
 def _angles(sides: Mapping[str, Values]) -> NamedValues:
-    named = [
-        (f"{name}_{side}", angle) for side, angles in sides.items() for name, angle in zip(GREEK, angles, strict=True)
-    ]
+    named = [(f"{name}_{side}", a) for side, angles in sides.items() for name, a in zip(GREEK, angles, strict=True)]
     return {name: (float(angle), "deg") for name, angle in named}
 
 
@@ -507,14 +503,13 @@ def fit(task: StageInput) -> SensorCalibration:
     of_turns = [s for turn in sinusoids for s in turn]
     fits = [linear_convergence(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in of_turns]
     cosine, condition = max(each.cosine for each in fits), max(each.condition for each in fits)
-    last, named = name == "scale_factor", effect(ASYMMETRY).parameters("accelerometer")
-    asymmetry = {p.name: Coefficient(float(v), p.unit) for p, v in zip(named, found.c, strict=True)}
+    last = name == "scale_factor"
     calibration = SensorCalibration(
         sensor="accelerometer",
         bias=found.bias,
         matrix=np.diag(1.0 / found.k),
         stages=(*task.stages, result),
-        effects=(FittedEffect(ASYMMETRY, asymmetry),) if last else (),
+        effects=(fitted_effect(ASYMMETRY, "accelerometer", found.c),) if last else (),
         convergence=Convergence(cosine, condition, len(theta), len(theta)),
     )
     kept = slice(0, after_c) if last else BASE

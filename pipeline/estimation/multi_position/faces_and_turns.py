@@ -329,16 +329,9 @@ class TurnsByHand:
         angles = np.sum(Phi * self.direction, axis=1)
         if self.by_length:
             angles = np.sign(self.stated) * np.linalg.norm(Phi, axis=1)
-        return [
-            TurnAngle(
-                recording=self.name[t],
-                time_s=float(self.time[t, 0]),
-                axis=name_of_axis(direction),
-                stated_deg=float(self.stated[t]),
-                angle_deg=float(angles[t]),
-            )
-            for t, direction in enumerate(self.direction)
-        ]
+        figures = np.stack([self.time[:, 0], self.stated, angles], axis=1).tolist()
+        turns = zip(self.name, self.direction, figures, strict=True)
+        return [TurnAngle(name, start, name_of_axis(axis), *both) for name, axis, (start, *both) in turns]
 
     def departures(self, residual: Values, deviation: Values) -> list[str]:
         """Describe the turns that differ from what is stated by more than its uncertainty, noise and bias explain.

@@ -32,13 +32,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 import scipy
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
-from pipeline.core.records import BIAS, Index, Mask, Motion, Noise, Values, base_values, matrix_of
+from pipeline.core.records import BIAS, Index, Mask, Motion, Noise, Values, base_values, matrix_of, motion_at_rest
 from pipeline.estimation import design
 from pipeline.estimation.design import EffectColumns, Terms
 from pipeline.estimation.engine import cholesky
@@ -300,21 +300,10 @@ def motion_of(part: Rests | Moves | TurnsByHand, force: Values, rate: Values, *,
     Derivatives of the motion are zero.
     """
     time, temperature, warming = (values.ravel() for values in (part.time, part.temperature, part.temperature_rate))
-    warm, nothing = not np.isnan(temperature).any(), np.zeros_like(force)
-    return Motion(
-        time=time,
-        specific_force=force,
-        angular_rate=rate,
-        angular_acceleration=nothing,
-        specific_force_rate=nothing,
-        temperature=temperature if warm else None,
-        temperature_rate=warming if warm else None,
-        angle=None,
-        rate=None,
-        axis=None,
-        still=np.full(len(time), still),
-        direction=nothing,
-    )
+    known: dict[str, Any] = {"specific_force": force, "angular_rate": rate, "direction": np.zeros_like(force)}
+    if not np.isnan(temperature).any():
+        known |= {"temperature": temperature, "temperature_rate": warming}
+    return replace(motion_at_rest(time), still=np.full(len(time), still), **known)
 
 
 def effect_readings(sensor: str, terms: Terms, motion: Motion, K: Values) -> Values:

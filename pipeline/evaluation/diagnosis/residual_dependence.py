@@ -380,7 +380,7 @@ def _most_significant(term: EffectColumns, sensor: str, ratio: Values) -> list[i
 
 def _unexplained(regression: _Columns, selection: Selection, entry: Dependence, noise: Noise | None) -> JSON:
     """Return the plot of the residual against a covariate, with the curve of the suggested form."""
-    signal, forms = _signal_and_forms(selection, entry)
+    signal, forms = _signal_forms(selection, entry)
     setting, values = WHITE_SETTING, _values(selection, signal)
     if noise is not None and np.any(noise.wander > 0):  # as expected: the fitted wander may contain the dependence
         setting = Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
@@ -403,9 +403,7 @@ def _unexplained(regression: _Columns, selection: Selection, entry: Dependence, 
     return {"covariate": entry.covariate, "signal": signal, "unit": unit, "panels": panels}
 
 
-def _signal_and_forms(
-    selection: Selection, entry: Dependence
-) -> tuple[str, list[tuple[Values, Sequence[float] | None]]]:
+def _signal_forms(selection: Selection, entry: Dependence) -> tuple[str, list[tuple[Values, Sequence[float] | None]]]:
     """Return the signal of a covariate, and the values and coefficients of the form on each axis."""
     observations, formulas = selection.observations, entry.form.formulas if entry.form else ()
     named = sorted({name for text in formulas for name in parse(text).signals})

@@ -134,7 +134,7 @@ def formats() -> dict[str, tuple[Format, Template]]:
         same = [name for name, (other, _) in formats_by_name.items() if other.file == declared.file]
         if same:
             raise ConfigurationError(
-                f"{template}: file: {declared.file} is also the file of {same[0]}.j2. Name another file"
+                f"{template}: file: {declared.file} is also the file of {same[0]}.j2: name another"
             )
         formats_by_name[template.stem] = declared, environment.get_template(template.name)
     environment.get_template("remarks.txt")  # compiled with the formats, whose texts hold it

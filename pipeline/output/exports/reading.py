@@ -41,7 +41,6 @@ from pipeline.core.records import (
     SENSOR_UNITS,
     SENSORS,
     STRAIGHT,
-    Coefficient,
     FittedEffect,
     SensorCalibration,
     Values,
@@ -51,7 +50,7 @@ from pipeline.output.exports import ExportedUnit, Format, export, formats, text_
 from pipeline.output.exports.sensors import SI, TEMPLATE_FUNCTIONS, UNIT_FACTORS, SensorFigures, before_use
 from pipeline.output.exports.text_kinds import Expressions, Node, parsed
 from pipeline.physics.compensation import Compensation, read_calibration, sensor_of
-from pipeline.physics.effects import effect, effect_of
+from pipeline.physics.effects import effect_of, fitted_effect
 from pipeline.physics.measurement import sensor_effects
 
 Counts = Mapping[str, float | None]  # sensor to its counts per g or deg/s, None if not stated
@@ -160,9 +159,7 @@ def _read_file(file: Path, format_name: str, declared: Format, counts: Counts) -
 
 def _stated_axes(remarks: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Return the axis map of each sensor from the remarks of a file; empty without a remark."""
-    stated = {
-        owner[1]: tuple(BODY_AXIS.findall(remark)) for remark in remarks if (owner := FRAME_REMARK.search(remark))
-    }
+    stated = {owner[1]: tuple(BODY_AXIS.findall(text)) for text in remarks if (owner := FRAME_REMARK.search(text))}
     return {s: stated.get(s) or stated.get("sensor") or STRAIGHT for s in SENSORS} if stated else {}
 
 
@@ -223,9 +220,7 @@ def _sensors_in(file: Path, declared: Format, content: Node) -> dict[str, dict[s
 def _read(file: Path, format_name: str, declared: Format, content: Node, counts: Counts) -> ImportedCalibration:
     sensors = _sensors_in(file, declared, content)
     if not sensors:
-        names = [
-            f"a name that ends in {ending}{Path(declared.file).suffix}" for ending in declared.sensor_endings.values()
-        ]
+        names = [f"a name that ends in {e}{Path(declared.file).suffix}" for e in declared.sensor_endings.values()]
         wanted = " or ".join(names) or ", ".join(
             str(declared.read_back[s]["where"]) for s in SENSORS if s in declared.read_back
         )
@@ -233,13 +228,9 @@ def _read(file: Path, format_name: str, declared: Format, content: Node, counts:
     per_unit = {s: counts.get(s) for s in SENSORS}
     lacking = [s for s in declared.required_counts if s in sensors and not per_unit[s]]
     if lacking:
-        raise InputError(
-            f"{format_name} is in counts: state the sensor, whose config states the counts per unit", str(file)
-        )
+        raise InputError(f"{format_name} is in counts: state the sensor, whose config states the counts", str(file))
     omitted = {k: v for k, v in declared.read_back.get("defaults", {}).items() if k not in content}
-    notes = (
-        [f"not in the file, so the default: {', '.join(f'{k} = {v:g}' for k, v in omitted.items())}"] if omitted else []
-    )
+    notes = [f"not in the file, by default:  {', '.join(f'{k} = {v:g}' for k, v in omitted.items())}"] * bool(omitted)
     tree = Expressions({**TEMPLATE_FUNCTIONS, "file": Node({**content, **omitted}), "counts": per_unit})
     calibrations = {}
     for s, expressions in sensors.items():
@@ -271,12 +262,9 @@ def _calibration(
     else:
         polynomial = arrays["bias"].reshape(3, 1)
     raw = factor  # units of the format per g or deg/s of a reading
-    sizes = np.linalg.svd(matrix, compute_uv=False)
-    if not UNIT_SCALE[0] < sizes[2] <= sizes[0] < UNIT_SCALE[1]:
-        if (
-            counts is None
-            or not UNIT_SCALE[0] < sizes[2] * counts / factor <= sizes[0] * counts / factor < UNIT_SCALE[1]
-        ):
+    sizes, (low, high) = np.linalg.svd(matrix, compute_uv=False), UNIT_SCALE
+    if not low < sizes[2] <= sizes[0] < high:
+        if counts is None or not low < sizes[2] * counts / factor <= sizes[0] * counts / factor < high:
             raise ValueError(
                 f"the matrix of the {sensor} multiplies readings by {sizes[2]:.3g} to {sizes[0]:.3g}: they are not in "
                 f"{declared.units[sensor]}, and not in the counts of the sensor that is stated "
@@ -292,7 +280,7 @@ def _calibration(
     effects = _thermal(sensor, polynomial, notes)
     for name, unit in (("g_sensitivity", raw), ("scale_factor_temperature", 1.0)):
         if np.any(values_of := arrays.get(name, np.zeros(1))):
-            effects.append(_fitted(name, sensor, values_of.ravel() / unit))
+            effects.append(fitted_effect(name, sensor, values_of.ravel() / unit))
     covariance = None
     if "bias_deviation" in arrays and np.any(arrays["bias_deviation"]):
         size = BASE_COUNT + sum(len(e.parameters) for e in effects)
@@ -308,16 +296,10 @@ def _thermal(sensor: str, polynomial: Values, notes: list[str]) -> list[FittedEf
     if np.any(polynomial[:, 4:]):
         notes.append(f"{sensor}: the bias beyond the third order of the temperature is left out")
     if np.any(polynomial[:, 3:4]):
-        return [_fitted("bias_temperature_cubic", sensor, polynomial[:, 1:4].ravel())]
+        return [fitted_effect("bias_temperature_cubic", sensor, polynomial[:, 1:4].ravel())]
     if np.any(polynomial[:, 2:3]):
-        return [_fitted("bias_temperature_quadratic", sensor, polynomial[:, 1:3].ravel())]
-    return [_fitted("bias_temperature", sensor, polynomial[:, 1])] if np.any(polynomial[:, 1:2]) else []
-
-
-def _fitted(name: str, sensor: str, values: Values) -> FittedEffect:
-    """Return a built-in effect with its values and unknown uncertainty."""
-    named = zip(effect(name).parameters(sensor), values.tolist(), strict=True)
-    return FittedEffect(name, {p.name: Coefficient(v, p.unit) for p, v in named})
+        return [fitted_effect("bias_temperature_quadratic", sensor, polynomial[:, 1:3].ravel())]
+    return [fitted_effect("bias_temperature", sensor, polynomial[:, 1])] if np.any(polynomial[:, 1:2]) else []
 
 
 def document_of(imported: ImportedCalibration) -> JSON:
@@ -481,18 +463,12 @@ def _explained(calibration: SensorCalibration, imported: ImportedCalibration) ->
     if calibration.covariance is not None:
         U = calibration.parameters.expanded_uncertainty
         expanded = {"bias": U[BIAS], "matrix": U[MATRIX].max()}
+    terms = {e.name: [_plain(t) for t in effect_of(e).in_c(e.values) or ()] for e in effects}
     return {
         "unit": SENSOR_UNITS[sensor],
         "calibration": calibration,
         "expanded": expanded,
-        "effects": [
-            {
-                "name": e.name,
-                "parameters": e.parameters,
-                "terms": [_plain(t) for t in effect_of(e).in_c(e.values) or ()],
-            }
-            for e in effects
-        ],
+        "effects": [{"name": e.name, "parameters": e.parameters, "terms": terms[e.name]} for e in effects],
         "bench": [e.name for e in calibration.effects if e not in effects],
         "centred": centred,
         "subtracted": centred - np.linalg.solve(calibration.matrix, truth),

@@ -142,12 +142,7 @@ def _white_and_walk(terms: JSON, longest_s: float) -> list[Values | None]:
         return [np.array([p["value"], *e], float) for p, e in zip(parts, ends, strict=True) if p["value"] is not None]
 
     processes = [(part, part["correlation_time_s"]["value"]) for part in terms["gauss_markov"]]
-    fast = [
-        np.sqrt(2.0 * time) * value
-        for part, time in processes
-        if time < MIN_EXPORTED_TIME_S
-        for value in intervals(part)
-    ]
+    fast = [np.sqrt(2.0 * time) * v for part, time in processes if time < MIN_EXPORTED_TIME_S for v in intervals(part)]
     slow = [
         np.sqrt(3.0 * allan_variance("gauss_markov", 1.0, np.array([longest_s]), time)[0] / longest_s) * value
         for part, time in processes
@@ -362,26 +357,17 @@ def temperatures(document: Mapping[str, Any]) -> list[float]:
     return known.get("soaked_degc") or known.get("temperature_degc") or TEMPERATURES
 
 
-TEMPLATE_FUNCTIONS: dict[str, Any] = {
-    "accelerometer_frame": accelerometer_frame,
+OF_POSES = (accelerometer_frame, lever_arm_of, pose, rotation_times_lower, row_lengths, static_transform, np.matmul)
+OF_FIGURES = (nearest_density, sampling_rate, temperatures, np.sqrt)
+TEMPLATE_FUNCTIONS: dict[str, Any] = {function.__name__: function for function in (*OF_POSES, *OF_FIGURES)} | {
     "identity": np.eye(3),
-    "lever_arm_of": lever_arm_of,
-    "matmul": np.matmul,
     "lower_half": np.triu_indices(3)[::-1],  # column by column
-    "nearest_density": nearest_density,
     "scaled": lambda value, factor: None if value is None else float(value * factor),
-    "sqrt": np.sqrt,
-    "pose": pose,
-    "static_transform": static_transform,
     "rint": lambda values: np.rint(values).astype(int).tolist(),
-    "rotation_times_lower": rotation_times_lower,
-    "row_lengths": row_lengths,
-    "sampling_rate": sampling_rate,
     "FACTORS": UNIT_FACTORS,
     "RADIAN": UNIT_FACTORS["rad/s"],
     "REFERENCE_TEMPERATURE": REFERENCE_TEMPERATURE,
     "SI": SI,
     "STANDARD_GRAVITY": STANDARD_GRAVITY,
     "clip": lambda value, limits: float(np.clip(value, *limits)),
-    "temperatures": temperatures,
 }

@@ -248,18 +248,11 @@ def lower(values: Any) -> Values:  # noqa: ANN401
     return matrix
 
 
-EXPRESSION_FUNCTIONS: dict[str, Any] = {
-    "axes": axes,
+OF_THE_FORMATS = (axes, lower, product, rotation, square, temperature_model, thermal)
+EXPRESSION_FUNCTIONS: dict[str, Any] = {function.__name__: function for function in OF_THE_FORMATS} | {
     "diagonal": np.diag,
     "given": lambda node, key, default: node.get(key, default),
-    "in_dps": lambda unit: 1.0 / (1.0 if unit in NO_UNIT else UNIT_FACTORS[unit]),
-    "in_g": lambda unit: 1.0 / (1.0 if unit in NO_UNIT else UNIT_FACTORS[unit]),
-    "lower": lower,
-    "product": product,
-    "rotation": rotation,
-    "square": square,
-    "temperature_model": temperature_model,
-    "thermal": thermal,
+    **dict.fromkeys(("in_dps", "in_g"), lambda unit: 1.0 / (1.0 if unit in NO_UNIT else UNIT_FACTORS[unit])),
     "times": lambda matrix, vector: square(matrix) @ np.asarray(vector, float),
     "ones": np.ones(3),
 }

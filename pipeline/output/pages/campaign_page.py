@@ -70,9 +70,7 @@ def render(
     settings, states = settings or {"campaign": campaign}, [*map(state_of, rows)]
     found = problems(states)
     devices = {row.get("serial") or row["unit"] for row in rows}
-    frame = pd.DataFrame(rows).reindex(
-        columns=list(dict.fromkeys([*SUMMARY_COLUMNS, *(k for row in rows for k in row)]))
-    )
+    frame = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*SUMMARY_COLUMNS, *(k for r in rows for k in r)])))
     for sensor in SENSORS:  # the error that the page states, in place of that of the magnitude
         for column, figure in (("error_before", "before"), ("error_after", "after"), ("noise_floor", "floor")):
             frame[f"{sensor}_{column}"] = [getattr(state.errors[sensor], figure) for state in states]

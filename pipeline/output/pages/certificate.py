@@ -106,9 +106,7 @@ def certificate(
         },
     }
     missing = [
-        {"what": what, "clause": clause, "key": key}
-        for what, clause, key, value in _wanted(document, stated)
-        if not value
+        {"what": w, "clause": clause, "key": key} for w, clause, key, value in _wanted(document, stated) if not value
     ]
     stamp = STAMP + ", ".join(m["what"] for m in missing) if missing else None
     return {"complete": not missing, "stamp": stamp, "missing": missing, **document}

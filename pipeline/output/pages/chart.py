@@ -305,9 +305,7 @@ def chart(
     parts.append(f'<g class="ticks">{labels}</g>')
     parts.append(text((x.start + x.stop) / 2, top - PANEL_GAP + 28, x_label, "m"))
     attributes = x.attribute(x_label, columns) + (f' data-names="{units}"' if units else "")
-    long = [
-        layer for p in panels for layer in p.layers if isinstance(layer, SampleMarks) and len(layer.x) > MAXIMUM_DOTS
-    ]
+    long = [one for p in panels for one in p.layers if isinstance(one, SampleMarks) and len(one.x) > MAXIMUM_DOTS]
     attributes += _full(long[0].x, long[0].x[:, None], x)[0] if long else ""
     return figure.drawn(description, top - PANEL_GAP + BOTTOM, "".join(parts), attributes)
 

@@ -133,7 +133,7 @@ def _spread(values: Values) -> float:
     return float(MEDIAN_SIZE * np.median(np.abs(values - np.median(values))))
 
 
-def _distributions(table: ValuesOfUnits, _: int) -> Iterable[JSON]:
+def _quantiles(table: ValuesOfUnits, _: int) -> Iterable[JSON]:
     v = table.value
     low, middle, high = np.percentile(v, [5.0, 50.0, 95.0]).tolist()
     found = {"units": len(v), "median": middle, "robust_standard_deviation": _spread(v)}
@@ -228,13 +228,7 @@ def _against_stated(devices: Sequence[ValuesOfUnits], parameters: int) -> JSON:
     return found | {"beyond_uncertainty": p * parameters < FLEET_TEST_LEVEL}
 
 
-STATISTICS = {
-    "distributions": _distributions,
-    "far": _far,
-    "drift": _drift,
-    "lots": _lots,
-    "repeatability": _repeatability,
-}
+STATISTICS = {"distributions": _quantiles, "far": _far, "drift": _drift, "lots": _lots, "repeatability": _repeatability}
 
 
 def _missing_effects(rows: Sequence[JSON]) -> list[str]:

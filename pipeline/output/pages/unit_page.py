@@ -226,9 +226,9 @@ def use_rows(part: JSON, noise: JSON | None) -> list[JSON]:
             sizes = [(each or {}).get("value") or (each or {}).get("upper_limit") for each in found]
             scale = scale_of(unit, *sizes)
             limits = ["" if (each or {}).get("value") else "< " for each in found]
-            texts = [
-                f"{less}{number(v / scale.factor)}" if v else NOTHING for less, v in zip(limits, sizes, strict=True)
-            ] + [""]
+            texts = [f"{s}{number(v / scale.factor)}" if v else NOTHING for s, v in zip(limits, sizes, strict=True)] + [
+                ""
+            ]
             rows.append({"name": f"noise {symbol}", "key": symbol, "texts": texts, "unit": scale.unit})
     return rows
 
@@ -262,10 +262,7 @@ def rest_rows(part: JSON) -> list[JSON]:
     """
     found = [part.get("rests") or {}, *(stage.get("details") or {} for stage in part.get("stages") or [])]
     rows = [
-        {**rest, "use": use}
-        for rests in found
-        for use in USES
-        for rest in rests.get(f"rests_{use.replace(' ', '_')}") or []
+        {**r, "use": use} for rests in found for use in USES for r in rests.get(f"rests_{use.replace(' ', '_')}") or []
     ]
     return sorted(rows, key=lambda row: (row["recording"], row["time_s"]))
 

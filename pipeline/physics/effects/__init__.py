@@ -25,7 +25,7 @@ from imu_logs.files import read_text
 from imu_logs.yaml_file import load_yaml
 from pipeline.core.errors import ConfigurationError, MissingInputError, PipelineError
 from pipeline.core.files import EFFECTS_FOLDER
-from pipeline.core.records import FittedEffect
+from pipeline.core.records import Coefficient, FittedEffect, Values
 from pipeline.core.settings import Table, UserEffectFiles
 from pipeline.physics.effects.base import Effect
 from pipeline.physics.effects.formula_effect import FormulaEffect, fitted_anyway, read_declaration
@@ -108,6 +108,12 @@ def forget(*names: str) -> None:
     """Remove registered effects from the catalogue; all of them where none is named."""
     for name in names or tuple(_registered):
         _registered.pop(name, None)
+
+
+def fitted_effect(name: str, sensor: str, values: Values) -> FittedEffect:
+    """Return an effect of the catalogue with its values, without an uncertainty."""
+    named = zip(effect(name).parameters(sensor), values.tolist(), strict=True)
+    return FittedEffect(name, {p.name: Coefficient(value, p.unit) for p, value in named})
 
 
 def effect(name: str) -> Effect:

@@ -138,9 +138,7 @@ class FormulaEffect(DeclaredEffect):
         Raises ``InputError`` if a value is not finite where its signals are finite, or the recording lacks a signal.
         """
         signals = {name: self._signal(name, sensor, motion) for name in self._names}
-        own, shared = (
-            [_value(term, signals, len(motion.time)) for term in terms] for terms in (self._by_axis, self._shared)
-        )
+        own, shared = ([_value(t, signals, len(motion.time)) for t in terms] for terms in (self._by_axis, self._shared))
         out = np.concatenate(own, axis=1) if self.layout == Layout.EVERY_AXIS else _stacked(own, len(motion.time))
         if self.layout == Layout.SHARED:
             columns = [AXES.index(axis) * len(own) + j for axis in self.declared.axes for j in range(len(own))]

@@ -48,7 +48,7 @@ from pipeline.physics.signal.rests import RATE_AT_REST_DPS, runs
 VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; a smaller error of the rate does no harm
 STEP_MULTIPLE_TOLERANCE = 1e-3  # of a step, to which the angles of an encoder are multiples of it: printed decimals
 ORDERS = (2, 3, 4)  # a motor that ripples, a program of constant accelerations, motion by a wheel
-ADDED_REST_SAMPLES = 5  # samples of rest added at both ends of a motion, which begins and ends at zero rate
+ADDED_REST = 5  # samples of rest added at both ends of a motion, which begins and ends at zero rate
 FEWEST_MOVED = 100  # changes of the angle: their autocorrelation is known to 0.1
 ROUNDING_AUTOCORRELATION = -0.35  # autocorrelation, half way between that of rounding errors and that of ramps
 MAX_ROUNDING_RATIO = 1.5  # times the errors of rounding, above which errors are not rounding alone
@@ -160,7 +160,7 @@ def _smoothed(time: Values, angle: Values, step: float, error: float) -> Encoder
     smooth, rate, noise = angle.copy(), np.zeros(n), np.zeros(n)
     starts = np.flatnonzero(np.diff(angle, prepend=np.nan) != 0.0)
     lengths = np.diff(np.append(starts, n))
-    lasts = time[starts + lengths - 1] - time[starts] > (step / RATE_AT_REST_DPS or ADDED_REST_SAMPLES * interval)
+    lasts = time[starts + lengths - 1] - time[starts] > (step / RATE_AT_REST_DPS or ADDED_REST * interval)
     moving = ~np.repeat(lasts, lengths)
     apart = (
         np.flatnonzero(np.diff(time) > MAX_ANGLE_GAP_INTERVALS * interval) + 1
@@ -169,15 +169,12 @@ def _smoothed(time: Values, angle: Values, step: float, error: float) -> Encoder
     vague = np.zeros(n, bool)
     for first, last in itertools.chain.from_iterable(map(itertools.pairwise, ends)):
         before, after = first in apart, last in apart
-        around = slice(
-            first if before else max(first - ADDED_REST_SAMPLES, 0),
-            last if after else min(last + ADDED_REST_SAMPLES, n),
+        around = slice(first if before else max(first - ADDED_REST, 0), last if after else min(last + ADDED_REST, n))
+        vague[first : first + ADDED_REST * before] = vague[max(last - ADDED_REST * after, first) : last] = (
+            before or after
         )
-        vague[first : first + ADDED_REST_SAMPLES * before] = vague[
-            max(last - ADDED_REST_SAMPLES * after, first) : last
-        ] = before or after
         part, span = slice(first - around.start, last - around.start), slice(first, last)
-        if around.stop - around.start <= 2 * ADDED_REST_SAMPLES:
+        if around.stop - around.start <= 2 * ADDED_REST:
             rate[span], noise[span] = np.gradient(angle[around], time[around])[part], np.sqrt(0.5) * error / interval
             continue
         size = error if step else (_errors(time[around], angle[around])[1] or error)

@@ -60,7 +60,7 @@ LINE_BLOCKS = 5  # of a third of a rest: noise alone passes q in 6e-9, a tremor 
 RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests differ by g-sensitivity and creep
 # Of a window's mean, whatever the tremor of the stretch. The rests of a published MPU-6050 recording in a hand reach
 # 1.7 except at the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
-TREMOR_LIMIT_DPS = 2.5
+TREMOR_DPS = 2.5
 SAME_DEG = 2.0  # the limit of a rest in ``pipeline.physics.signal.rests``
 ROUNDING_TERMS = 1000  # harmonics, with which u^2 of readings without noise is 6e-4 too small
 COARSE = float(np.sqrt(0.25 + 1.0 / 12.0))  # steps, scatter of readings with noise of half a step
@@ -182,9 +182,7 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
     noise = np.array([median(variance) for _, variance in of_parts])
     spread = np.where(resting[:, None], spread, np.median(spread, axis=0))
     count = counts_of(differences)
-    limit = np.minimum(
-        SIGNIFICANT_TURN * np.maximum(white, spread), np.maximum(SIGNIFICANT_TURN * white, TREMOR_LIMIT_DPS)
-    )
+    limit = np.minimum(SIGNIFICANT_TURN * np.maximum(white, spread), np.maximum(SIGNIFICANT_TURN * white, TREMOR_DPS))
     limit = np.maximum(limit, count * (1.0 + DECIMAL_ROUNDING))
     loud = SIGNIFICANT_TURN**2 * np.maximum(np.where(resting, noise, np.median(noise)), np.sum(count**2) / 12.0)
     pieces: Spans = []

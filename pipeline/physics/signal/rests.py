@@ -259,9 +259,7 @@ def _at_the_ends(recording: Recording, quiet: Spans) -> list[Rest]:
         source = {**recording.source, RATE_AT_REST: np.mean(means, axis=0).tolist()}
         recording = replace(recording, source=source)
     rests = [Rest(start, stop) for start, stop in quiet]
-    return [
-        replace(r, accepted=not why, reason=why) for r, why in zip(rests, _rate_reasons(recording, rests), strict=True)
-    ]
+    return [replace(r, accepted=not why, reason=why) for r, why in zip(rests, _reasons(recording, rests), strict=True)]
 
 
 def _interval(recording: Recording) -> float:
@@ -277,7 +275,7 @@ def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noi
     ``noise_variance``: of the specific force at rest, g^2, summed over the axes.
     """
     rests = [Rest(start, stop) for start, stop in intervals]
-    pairs = zip(rests, _rate_reasons(recording, rests), strict=True)
+    pairs = zip(rests, _reasons(recording, rests), strict=True)
     reasons = [_turn(recording, r) or _scatter(recording, r, noise_variance) or of_rate for r, of_rate in pairs]
     return [replace(r, accepted=not why, reason=why) for r, why in zip(rests, reasons, strict=True)]
 
@@ -344,7 +342,7 @@ def _turn(recording: Recording, rest: Rest) -> str:
     return f"direction of the specific force moves by {angle:.1f} deg (limit {TURN_LIMIT_DEG:g} deg)"
 
 
-def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
+def _reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
     """Compare the mean angular rate of each rest with the median of its neighbours in time, or with other recordings.
 
     Not of all rests of a recording, because the bias changes with the temperature.
