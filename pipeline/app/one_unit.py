@@ -261,10 +261,8 @@ def _of_mapping(row: UnitRow, recordings: Any) -> tuple[UnitRow, UnitFiles]:  # 
             )
     lacking = [n for n, entry in known.items() if n not in recordings and not entry.optional]
     if lacking:
-        raise MissingInputError(
-            f"missing recordings: {', '.join(lacking)}; procedure {procedure.name} needs them"
-            f"{of_one_sensor(procedure, recordings)}"
-        )
+        needed = f"procedure {procedure.name} needs them{of_one_sensor(procedure, recordings)}"
+        raise MissingInputError(f"missing recordings: {', '.join(lacking)}; {needed}")
     frames = {n: _text_of(n, r) for n, r in recordings.items() if not isinstance(r, str | os.PathLike)}
     paths = {n: str(Path(r).resolve()) for n, r in recordings.items() if n not in frames}
     columns = row.config.ingest.csv.get("columns")

@@ -312,12 +312,8 @@ class Monitor(logging.Handler):
             lines += [f"\n{self.results} cannot be written; make it writable, then:", f"  {command}"]
         if self.refused == "LockException":
             unlock = shlex.join(["snakemake", "--unlock", *sys.argv[1:]])
-            lines += [
-                "\nAnother run uses this directory, or one was killed here. Wait until it has ended, then:",
-                f"  {command}",
-                "If no run is active:",
-                f"  {unlock} && {command}",
-            ]
+            wait = "\nAnother run uses this directory, or one was killed here. Wait until it has ended, then:"
+            lines += [wait, f"  {command}", "If no run is active:", f"  {unlock} && {command}"]
         if self.interrupted or getattr(sys, "last_type", None) is KeyboardInterrupt:
             lines += ["\nThe run was interrupted. Finished jobs are kept, the others start again. To continue:"]
             lines += [f"  {command}"]

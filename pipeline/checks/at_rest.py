@@ -82,11 +82,8 @@ def with_rates_at_rest(recordings: Sequence[Recording]) -> list[Recording]:
 
     A slow turn about the vertical looks like a rest to the accelerometer.
     """
-    at_rest = [
-        median(r.gyroscope[r.valid])
-        for r in recordings
-        if r.kind == "rest" and r.role != "validation" and r.gyroscope is not None and r.valid.any()
-    ]
+    still = [r for r in recordings if r.kind == "rest" and r.role != "validation" and r.gyroscope is not None]
+    at_rest = [median(r.gyroscope[r.valid]) for r in still if r.gyroscope is not None and r.valid.any()]
     if not at_rest:
         return list(recordings)
     usual = median(np.array(at_rest)).tolist()
@@ -230,12 +227,8 @@ def _moving(recording: Recording, sensor: str, blocks: Values, sheet: DataSheet,
 def _slow(data_sheet: DataSheet, change: float, duration: float) -> float:
     """Return the largest plausible change of a bias at rest, for a change of temperature (degC) and a duration (s)."""
     effects = data_sheet.effects
-    return (
-        SIGNIFICANT_DEVIATIONS_AT_REST * data_sheet.bias_wander
-        + effects.get("bias_drift", 0.0) * duration
-        + effects.get("bias_temperature", 0.0) * change
-        + effects.get("warm_up", 0.0)
-    )
+    wander = SIGNIFICANT_DEVIATIONS_AT_REST * data_sheet.bias_wander + effects.get("bias_drift", 0.0) * duration
+    return wander + effects.get("bias_temperature", 0.0) * change + effects.get("warm_up", 0.0)
 
 
 def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
@@ -317,12 +310,8 @@ def _check_copies(recording: Recording) -> None:
             same, by_chance = ((a[1:] == sign * other)[changing] for other in (b[1:], b[:-1]))
             if same.mean() - by_chance.mean() > least:
                 names = [TRIADS[sensor][i] for i in (one, two)]
-                raise refusal(
-                    recording,
-                    "copied_axis",
-                    f"{names[1]} is {what} of {names[0]} in {same.mean():.0%} of the rows in which it changes",
-                    f"correct ingest.csv.columns.{names[1]}.column",
-                )
+                message = f"{names[1]} is {what} of {names[0]} in {same.mean():.0%} of the rows in which it changes"
+                raise refusal(recording, "copied_axis", message, f"correct ingest.csv.columns.{names[1]}.column")
 
 
 def _check_spans(recording: Recording) -> None:

@@ -321,12 +321,9 @@ def check_frames_by_hand(recording: Recording, maps: Mapping[str, Sequence[str]]
     if contradiction is None:
         return
     text, D = contradiction
-    raise IngestError(
-        f"accelerometer and gyroscope contradict each other: {text}; both belong in one right-handed frame",
-        recording.source.get("file"),
-        code="mirrored_axes",
-        hint=_cure(D, None, maps),
-    )
+    message = f"accelerometer and gyroscope contradict each other: {text}; both belong in one right-handed frame"
+    file = recording.source.get("file")
+    raise IngestError(message, file, code="mirrored_axes", hint=_cure(D, None, maps))
 
 
 def other_axes(moves: Sequence[MoveByHand]) -> tuple[str, Values | None] | None:
@@ -353,11 +350,8 @@ def other_axes(moves: Sequence[MoveByHand]) -> tuple[str, Values | None] | None:
 @cache
 def signed_permutations() -> list[Values]:
     """Return the 48 maps of axes onto signed axes: (3, 3) arrays."""
-    return [
-        axis_matrix([s + a for s, a in zip(signs, order, strict=True)])
-        for order in itertools.permutations(AXES)
-        for signs in itertools.product("+-", repeat=3)
-    ]
+    orders = itertools.product(itertools.permutations(AXES), itertools.product("+-", repeat=3))
+    return [axis_matrix([s + a for s, a in zip(signs, order, strict=True)]) for order, signs in orders]
 
 
 def nearest_permutation(total: Values) -> Values | None:

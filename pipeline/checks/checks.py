@@ -359,9 +359,5 @@ def _check_pair(one: Recording, two: Recording, first: Index, second: Index) -> 
     spans = {one.name: (first[a], first[b]), two.name: (second[a], second[b])}
     rows, copied = (place(r, int(spans[r.name][0]), int(spans[r.name][1])) for r in (late, early))
     held_out = "; held-out motion would not be held out" if late.role == "validation" else ""
-    raise refusal(
-        late,
-        "shared_rows",
-        f"{rows} are those of recording {early.name}, {copied} ({common} rows are the same){held_out}",
-        "record each by itself, or remove the copy",
-    )
+    message = f"{rows} are those of recording {early.name}, {copied} ({common} rows are the same){held_out}"
+    raise refusal(late, "shared_rows", message, "record each by itself, or remove the copy")

@@ -94,11 +94,8 @@ def check_mounting(recordings: Sequence[Recording], settings: Settings) -> list[
         file = first.turn.recording.source.get("file")
         raise IngestError(first.problem + also, file, code=first.code, hint=hint)
     if seated:  # a zero within the tolerance is a part of the turn's mounting
-        zeros = {
-            t.name: t.stated.zero_deg
-            for t in found
-            if t.found is not None and abs(t.found.zero_deg - t.stated.zero_deg) <= tolerance
-        }
+        near = [t for t in found if t.found is not None and abs(t.found.zero_deg - t.stated.zero_deg) <= tolerance]
+        zeros = {t.name: t.stated.zero_deg for t in near}
     used, details = [], {}
     for turn in turns:
         departure = departures.get(turn.name)

@@ -69,12 +69,8 @@ ANGLE_UNITS = (
     (1.0 / 360.0, "looks like turns declared as deg"),
     *WRONG_FACTORS,
 )
-TIME_UNIT_FACTORS = (
-    (1e3, "ms declared as s"),
-    (1e6, "us declared as s"),
-    (1e9, "ns declared as s"),
-    (1e-3, "s declared as ms"),
-)
+TIME_UNIT_FACTORS = tuple((factor, f"{unit} declared as s") for factor, unit in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")))
+TIME_UNIT_FACTORS += ((1e-3, "s declared as ms"),)
 OTHER_AXIS = 0.5  # the axis that turns reads more than twice as much as one that leans by up to 26 deg
 LEAST_TOTAL_DEG = 1.0  # over a recording, for a ratio
 # relative, between the quartiles of the blocks' ratios: beyond it the channels differ in more than scale

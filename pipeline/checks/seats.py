@@ -211,10 +211,8 @@ def seat_notes(turns: Sequence[TurnRecording], table: Table, sensor: Sensor) -> 
     effects = sensor.accelerometer.effects
     limits = [effects.get(name, limit) for name, limit in BENCH_LIMITS.items()]
     details: dict[str, str] = {}
-    setups = [
-        _conventional([(t, t.stated) for t in turns if t.recording.setup == setup])
-        for setup in dict.fromkeys(t.recording.setup for t in turns)
-    ]
+    names = dict.fromkeys(t.recording.setup for t in turns)
+    setups = [_conventional([(t, t.stated) for t in turns if t.recording.setup == name]) for name in names]
     complete = [(every, slow) for every, slow in setups if {c.axis for c in slow} == set(range(3))]
     for every, slow in complete or [_conventional([(t, t.stated) for t in turns])]:
         in_doubt = any(note.code == "N-REFERENCE" for c in slow for note in c.turn.recording.notes)

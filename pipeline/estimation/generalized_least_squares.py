@@ -386,14 +386,9 @@ def calibration_of(
         replaces=before.stages[-1].name if before is not None and before.stages else None,
     )
     stage = StageResult("effects", parameters, fit.residual_rms, None, details)
-    found = replace(
-        before or SensorCalibration(sensor),
-        bias=fit.bias,
-        matrix=matrix,
-        stages=(*(before.stages if before else ()), stage),
-        effects=effects,
-        converged=fit.converged,
-    )
+    stages = (*(before.stages if before else ()), stage)
+    found = before or SensorCalibration(sensor)
+    found = replace(found, bias=fit.bias, matrix=matrix, stages=stages, effects=effects, converged=fit.converged)
     if settings is None:
         return combined(found, [scatter_contribution(covariance, fit.degrees_of_freedom)], {})
     names = [term.effect.name for term in fit.terms]

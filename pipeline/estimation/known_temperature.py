@@ -35,10 +35,8 @@ def known(sensor: str, data_sheet: DataSheet) -> list[FittedEffect]:
         s = np.array(stated.scale_factor)
         values["scale_factor_temperature"] = s / (1.0 + s * (REFERENCE_TEMPERATURE - stated.reference_degc))
     if not values:
-        raise ConfigurationError(
-            f"sensor.{sensor}.{NAME} states neither bias nor scale_factor: state a coefficient, or choose another "
-            f"method.{sensor}"
-        )
+        lack = f"sensor.{sensor}.{NAME} states neither bias nor scale_factor"
+        raise ConfigurationError(f"{lack}: state a coefficient, or choose another method.{sensor}")
     return [fitted_effect(name, sensor, of_axes) for name, of_axes in values.items()]
 
 

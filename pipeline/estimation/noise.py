@@ -404,11 +404,8 @@ def required_noises(
     recordings: UnitRecordings, sensor_model: Sensor, calibrations: Mapping[str, SensorCalibration | None]
 ) -> dict[str, Noise]:
     """Return the noise of each calibrated sensor; ``ConfigurationError`` if nothing determines it."""
-    return {
-        sensor: recordings.noises[sensor] or estimate_noise(sensor, recordings.filtered, sensor_model.of(sensor))
-        for sensor, calibration in calibrations.items()
-        if calibration is not None
-    }
+    known, noises = [s for s, c in calibrations.items() if c is not None], recordings.noises
+    return {s: noises[s] or estimate_noise(s, recordings.filtered, sensor_model.of(s)) for s in known}
 
 
 def wander_prior(noise: Noise | None, data_sheet: DataSheet) -> WanderPrior:

@@ -105,13 +105,9 @@ def allan_variance(name: str, value: float, tau: Values, constant: float = np.na
     if name == "sinusoid":
         x = np.pi * constant * tau
         return np.asarray(value**2 * np.sin(x) ** 4 / x**2)
-    power = {
-        "quantisation": 3.0 / tau**2,
-        "white": 1.0 / tau,
-        "bias_instability": np.full_like(tau, 2.0 * np.log(2.0) / np.pi),
-        "random_walk": tau / 3.0,
-        "ramp": tau**2 / 2.0,
-    }
+    instability = np.full_like(tau, 2.0 * np.log(2.0) / np.pi)
+    power = {"quantisation": 3.0 / tau**2, "white": 1.0 / tau, "bias_instability": instability}
+    power |= {"random_walk": tau / 3.0, "ramp": tau**2 / 2.0}
     return np.asarray(value**2 * power[name])
 
 

@@ -233,13 +233,8 @@ def answers(searches: Sequence[SetSearch | None], owner: Callable[[EffectSet], i
     ``searches``: None if none of its sets is possible. ``owner``: index of the search to which a set belongs.
     ``names``: effects whose upper limits are computed. Both forms of a free curve count as one.
     """
-    pool = {
-        key: (search, found)
-        for k, search in enumerate(searches)
-        if search is not None
-        for key, found in search.pool.items()
-        if owner(key) == k
-    }
+    possible = [(k, search) for k, search in enumerate(searches) if search is not None]
+    pool = {key: (search, of) for k, search in possible for key, of in search.pool.items() if owner(key) == k}
     score = np.array([found.score for _, found in pool.values()])
     weight = np.exp(score - score.max())
     weight /= weight.sum()
@@ -464,11 +459,8 @@ def _problem(selection: Selection, fit: JointFit, candidates: Mapping[str, Effec
     observations = selection.observations
     configured = fit.terms[: len(selection.base.terms)]
     fitted = {t.effect.name: t.values for t in fit.terms[len(configured) :]}
-    listed = [
-        (name, term, weight)
-        for name, candidate in candidates.items()
-        for term, weight in _versions(observations.sensor, fit, candidate)
-    ]
+    versions = {name: _versions(observations.sensor, fit, candidate) for name, candidate in candidates.items()}
+    listed = [(name, term, weight) for name, each in versions.items() for term, weight in each]
     known = BASE_COUNT + sum(len(term.values) for term in configured)
     design, base, products, logarithms, places = _products(selection, fit, listed, known)
     settings = [WHITE_SETTING, *selection.settings, *random_walks(selection.settings).values()]

@@ -81,11 +81,9 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
     rests = rests_from_table(recording) or find_rests(recording)
     accepted = [rest for rest in rests if rest.accepted]
     held = range(every // 2, len(accepted), every) if every and recording.kind in BY_HAND else range(0)
-    return RestSplit(
-        used=tuple(rest for i, rest in enumerate(accepted) if i not in held),
-        held_out=tuple(accepted[i] for i in held),
-        left_out=tuple(rest for rest in rests if not rest.accepted),
-    )
+    used = tuple(rest for i, rest in enumerate(accepted) if i not in held)
+    left_out = tuple(rest for rest in rests if not rest.accepted)
+    return RestSplit(used=used, held_out=tuple(accepted[i] for i in held), left_out=left_out)
 
 
 def held_out_rests(recordings: Sequence[Recording], procedure: Procedure) -> dict[str, list[Rest]]:

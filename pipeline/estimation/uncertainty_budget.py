@@ -183,11 +183,8 @@ def changes_by_hand(
     if isinstance(model, AccelerometerModel):
         model.after_moves = True
     warm = bool(np.all(np.isfinite(model.rests.temperature)))
-    listed = [
-        (this, start, limits)
-        for this, start, limits in limited_effects(model.sensor, modelled, data_sheet)
-        if ("temperature" not in this.needs or warm) and set(this.needs) <= {"temperature"}
-    ]
+    signals, every = {"temperature"} if warm else set[str](), limited_effects(model.sensor, modelled, data_sheet)
+    listed = [(this, start, limits) for this, start, limits in every if set(this.needs) <= signals]
     equations = model.equations(fitted.state, [EffectColumns(this, start) for this, start, _ in listed])
     found: dict[str, Values] = {}
     for (this, _, limits), columns in zip(listed, equations.candidates, strict=True):
@@ -445,11 +442,7 @@ def with_uncertainty(fit: SensorCalibration, covariance: Values, freedom: Values
     for one in fit.effects:
         parameters = {n: replace(p, expanded_uncertainty=next(expanded) or None) for n, p in one.parameters.items()}
         effects.append(replace(one, parameters=parameters))
+    least = float(known.min()) if len(known) else float("inf")
     return replace(
-        fit,
-        effects=tuple(effects),
-        covariance=covariance,
-        degrees_of_freedom=float(known.min()) if len(known) else float("inf"),
-        freedom=freedom,
-        budget=budget,
+        fit, effects=tuple(effects), covariance=covariance, degrees_of_freedom=least, freedom=freedom, budget=budget
     )

@@ -99,11 +99,8 @@ def from_parquet(content: bytes, name: str) -> list[Recording]:
         raise InputError("holds no recordings: it was not written by ingest or filter", name)
     description = json.loads(text)
     if description["schema_version"] != PARQUET_VERSION:
-        raise InputError(
-            f"schema_version {description['schema_version']} is not known to this version ({PARQUET_VERSION}); "
-            "delete the results and run again",
-            name,
-        )
+        found = f"schema_version {description['schema_version']} is not known to this version ({PARQUET_VERSION})"
+        raise InputError(f"{found}; delete the results and run again", name)
     decoded: dict[str, Any] = {}
 
     def read(start: int, rows: int, names: Sequence[str]) -> list[NDArray[Any]]:

@@ -457,11 +457,8 @@ def _merged(sensor: Log, log: Log, rows: slice, tau: Values, clock: dict[str, fl
     part = sensor.select(rows, *(() if same else log.notes), *notes)
     joined = {} if same else {"joined": [*sensor.source.get("joined", []), log.source]}
     sensor_channels = {c: v for c, v in part.values.items() if c not in log.values and c != TABLE_TIME}
-    return replace(
-        part,
-        values=sensor_channels | {channel: at(tau) for channel, at in found.items()},
-        source=sensor.source | ({"table_clock": clock} if clock else {}) | joined,
-    )
+    source = sensor.source | ({"table_clock": clock} if clock else {}) | joined
+    return replace(part, values=sensor_channels | {c: at(tau) for c, at in found.items()}, source=source)
 
 
 def follow_program(table: Log, program: Sequence[ProgramRest | ProgramTurn | Repeated]) -> Log:

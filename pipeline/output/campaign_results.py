@@ -128,11 +128,8 @@ class CampaignResults:
         ``change_percent`` (of mean_abs_error, relative to raw), ``vector_rms_error`` (empty without an attitude
         reference), ``noise_floor`` and ``vector_noise_floor`` (rms error that noise alone causes).
         """
-        rows = (
-            {**part, **step, **about, "step": step["name"]}
-            for about, part in self._parts("validation")
-            for step in part.get("steps") or []
-        )
+        steps = ((about, part, step) for about, part in self._parts("validation") for step in part.get("steps") or [])
+        rows = ({**part, **step, **about, "step": step["name"]} for about, part, step in steps)
         return pd.DataFrame(rows, columns=["unit", "sensor", *ERROR_COLUMNS])
 
     @cached_property

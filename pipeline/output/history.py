@@ -72,11 +72,9 @@ def flat(value: Any, above: str = "") -> dict[str, str]:  # noqa: ANN401  (any J
     if isinstance(value, dict) and (value or not above):
         return {k: v for key, part in value.items() for k, v in flat(part, f"{above}.{key}" if above else key).items()}
     text = value if isinstance(value, str) else json.dumps(value)
-    return {
-        above: text
-        if len(text) <= MAX_VALUE_LENGTH
-        else f"{text[: MAX_VALUE_LENGTH - DIGEST_DIGITS]}... ({digest(value)})"
-    }
+    if len(text) > MAX_VALUE_LENGTH:
+        text = f"{text[: MAX_VALUE_LENGTH - DIGEST_DIGITS]}... ({digest(value)})"
+    return {above: text}
 
 
 def unit_state(

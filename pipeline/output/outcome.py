@@ -158,11 +158,8 @@ def commands_of(
         return {}
     effects = [f"{sensor}.{name}" for name in part["selected"]]
     verb = "add" if part["verdict"] == Verdict.MISSING_EFFECT else "try"
-    return {
-        "verb": f"{verb} {'it' if len(effects) == 1 else 'them'}",
-        "add": add_command(settings, unit, effects, results),
-        "once": once_command(settings, unit, part["override"], results),
-    }
+    them, once = "it" if len(effects) == 1 else "them", once_command(settings, unit, part["override"], results)
+    return {"verb": f"{verb} {them}", "add": add_command(settings, unit, effects, results), "once": once}
 
 
 def command_of(problem: Problem, settings: Mapping[str, Any], results: str = DEFAULT_RESULTS) -> str:

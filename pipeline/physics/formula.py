@@ -42,12 +42,8 @@ POWER_FUNCTIONS: dict[float, tuple[Callable[..., Any], str, str]] = {  # in C of
 IN_C_ONCE = {f"(m->temperature - (imu_real){25.0!r})": "dt"}  # calibration.h has a name for it
 SIMPLE_IN_C = re.compile(r"[\w\[\]{}>-]+")  # a name: to evaluate it twice costs nothing
 STRANGE = re.compile(r"[^A-Za-z0-9_ .+\-*/(),]")
-HINTS = {
-    "^": "; write ** for a power",
-    "=": "; a formula has no names of its own",
-    "<": "; use step(x) or band(x, low, high)",
-    ">": "; use step(x) or band(x, low, high)",
-}
+HINTS = {"^": "; write ** for a power", "=": "; a formula has no names of its own"}
+HINTS |= dict.fromkeys("<>", "; use step(x) or band(x, low, high)")
 
 
 class Signal(NamedTuple):

@@ -109,10 +109,8 @@ def _reference_motion(
     else:
         return None
     if recording.samples < 6:
-        raise InputError(
-            f"recording {recording.name} has {recording.samples} samples; at least 6 are needed to follow the table",
-            recording.source.get("file"),
-        )
+        message = f"recording {recording.name} has {recording.samples} samples; 6 are needed to follow the table"
+        raise InputError(message, recording.source.get("file"))
     warm = recording.temperature is not None
     own_clock = "table" if "table_clock" in recording.source else "sensor"
     logged = partial(
@@ -170,17 +168,9 @@ def _motion_of_turn(
             "level": lambda: turned(home),
             "reference_valid": known,
         }
-        return logged(
-            Motion(
-                time=time,
-                temperature=None,
-                axis=axis,
-                still=still,
-                at_offset=partial(at, before + offset, lag),
-                at_lag=partial(at, before + offset),
-                **deferred,
-            )
-        )
+        at_offset, at_lag = partial(at, before + offset, lag), partial(at, before + offset)
+        deferred |= {"axis": axis, "still": still, "at_offset": at_offset, "at_lag": at_lag}
+        return logged(Motion(time=time, temperature=None, **deferred))
 
     return at(0.0)
 

@@ -68,13 +68,8 @@ ESTIMATE_IT = (
     "choose a method that estimates it (method=rests_and_moves by hand, method=reference_least_squares on a table)"
 )
 NOT_DIAGNOSED = "the diagnosis failed, so that it is not known what the recordings show"
-LEFT_OUT_REASONS = {
-    "N-STUCK": "stuck",
-    "N-CLIP": "clipped",
-    "N-DISTURBED": "glitches or knocks",
-    "N-SHAKEN": "shaken at rest",
-    "N-MOVED": "moving",
-}  # notes on rows that no fit uses, and the reason
+LEFT_OUT_REASONS = {"N-STUCK": "stuck", "N-CLIP": "clipped", "N-DISTURBED": "glitches or knocks"}
+LEFT_OUT_REASONS |= {"N-SHAKEN": "shaken at rest", "N-MOVED": "moving"}
 MULTIPLE = 4.0  # see above
 LOW_COST_BIAS = {"accelerometer": 0.08 / 2.0, "gyroscope": 20.0 / 250.0}  # share of the range, see above
 LOW_COST_SCALE, LOW_COST_CROSS = 0.03, 0.02  # see above
@@ -114,10 +109,8 @@ def with_open(sensor: str, fit: SensorCalibration, hidden: Mapping[str, Mapping[
     U, k = (values[BASE] for values in (parameters.expanded_uncertainty, parameters.coverage_factor))
     found = list(_open(sensor, fit, hidden, U))
     u_open = np.sqrt((U / k) ** 2 + sum((a**2 / 3.0 for _, a, _ in found), np.zeros(len(U))))
-    return {
-        "open": [{"effect": name, "up_to": _shaped(a), "reason": reason} for name, a, reason in found],
-        "uncertainty_with_open": _shaped(k * u_open),
-    }
+    largest = [{"effect": name, "up_to": _shaped(a), "reason": reason} for name, a, reason in found]
+    return {"open": largest, "uncertainty_with_open": _shaped(k * u_open)}
 
 
 def _open(
@@ -155,11 +148,8 @@ def _open(
     for entry in calibration.budget.not_included if calibration.budget else ():
         if entry.up_to and entry.source in OF_BUDGET:
             bias = np.full(3, entry.up_to.get("bias", 0.0))
-            yield (
-                OF_BUDGET[entry.source],
-                base_values(bias, entry.up_to.get("matrix", 0.0) * np.abs(calibration.matrix)),
-                entry.reason,
-            )
+            up_to = entry.up_to.get("matrix", 0.0) * np.abs(calibration.matrix)
+            yield OF_BUDGET[entry.source], base_values(bias, up_to), entry.reason
 
 
 def _largest(calibration: SensorCalibration, name: str) -> Values:

@@ -300,10 +300,8 @@ def _wrapped(recording: Recording) -> Recording:
 
 def _joined(recordings: Sequence[Recording], planned: Sequence[Planned], starts: Sequence[float]) -> Recording:
     """Join successive recordings to one, with the table's angle, rate and attitude throughout."""
-    blocks: dict[str, Any] = {
-        name: np.concatenate([getattr(r, name) for r in recordings])
-        for name in ("time_ns", "accelerometer", "gyroscope", "temperature")
-    }
+    channels = ("time_ns", "accelerometer", "gyroscope", "temperature")
+    blocks: dict[str, Any] = {name: np.concatenate([getattr(r, name) for r in recordings]) for name in channels}
     whole = replace(recordings[0], name="recording", role="session", axis=None, **blocks, **NO_TABLE)
     table: dict[str, Any] = _logged(planned, starts, whole.time)
     return replace(whole, **table)
@@ -424,12 +422,9 @@ def write_campaign(
 
 def _sheet_rows(description: Description) -> list[dict[str, Any]]:
     """Return the rows of ``units.csv``: units, variants with the recordings of a unit, further rows."""
-    rows: list[dict[str, Any]] = [
-        {"unit": unit.unit, "sensor": unit.sensor, "table": unit.table, "procedure": unit.procedure}
-        | columns_of(unit)
-        | unit.columns
-        for unit in description.units
-    ]
+    keys = ("unit", "sensor", "table", "procedure")
+    units = description.units
+    rows: list[dict[str, Any]] = [{k: getattr(u, k) for k in keys} | columns_of(u) | u.columns for u in units]
     variants = []
     for variant, row in product(description.variants or (), rows):
         changed = {**row, **variant.columns, "unit": f"{row['unit']}{variant.suffix}"}

@@ -215,11 +215,8 @@ def _turns(course: Course) -> list[Planned]:
         _continuous(i, course, course.rest_s, rates) if rates else CommandedTurns(i, stops) for i in range(3)
     ]
     gyroscope = [_continuous(i, course, course.warm_up_rest_s, course.rates_dps) for i in range(3)]
-    return [
-        Planned(f"{prefix}_{AXES[turn.axis]}", role, turn.axis, turn)
-        for prefix, role, turns in (("accel", "accelerometer", accelerometer), ("gyro", "gyroscope", gyroscope))
-        for turn in turns
-    ]
+    both = (("accel", "accelerometer", accelerometer), ("gyro", "gyroscope", gyroscope))
+    return [Planned(f"{prefix}_{AXES[t.axis]}", role, t.axis, t) for prefix, role, turns in both for t in turns]
 
 
 def _continuous(axis: int, course: Course, before_s: float, rates: Sequence[float]) -> CommandedTurns:

@@ -203,11 +203,9 @@ def _refuse_stronger(layers: Sequence[Layer], key: str, directory: Path, unit: s
             continue
         if origin.startswith("units.csv line"):
             line = origin.removeprefix("units.csv line ").split(",")[0]
-            raise ConfigurationError(
-                f"the column overrides sets {text} for unit {unit}, which is stronger than "
-                f"{DEVICES_FOLDER}/{unit}.yaml: edit this cell, or clear it",
-                f"{directory / 'units.csv'}:{line}",
-            )
+            cell, file = f"the column overrides sets {text} for unit {unit}", f"{DEVICES_FOLDER}/{unit}.yaml"
+            message = f"{cell}, which is stronger than {file}: edit this cell, or clear it"
+            raise ConfigurationError(message, f"{directory / 'units.csv'}:{line}")
         if origin.startswith("command line"):
             raise ConfigurationError(
                 f"--config {origin.removeprefix('command line, ')}{text} is stronger than "
@@ -402,12 +400,8 @@ def _effects_of_units(arguments: argparse.Namespace, campaign: str) -> dict[str,
 
 
 def _missing(row: Mapping[str, str], only: str) -> list[tuple[str, str]]:
-    effects = [
-        (sensor, name)
-        for sensor in SENSORS
-        if row.get(f"{sensor}_verdict") == Verdict.MISSING_EFFECT
-        for name in row[f"{sensor}_selected"].split(";")
-    ]
+    found = [s for s in SENSORS if row.get(f"{s}_verdict") == Verdict.MISSING_EFFECT]
+    effects = [(sensor, name) for sensor in found for name in row[f"{sensor}_selected"].split(";")]
     return [(sensor, name) for sensor, name in effects if not only or name == only]
 
 

@@ -402,11 +402,8 @@ def _readings_of(campaign: Campaign, unit: str) -> dict[str, Reading]:
 
 def _facts_of_recording(reading: Reading, campaign: Campaign, checked: Sequence[Recording]) -> list[Line]:
     """Return the content of a recording after ingest, and the parts if ingest cuts it."""
-    parts = [
-        r
-        for r in checked
-        if campaign.recorded / r.source["file"] == reading.files[0] and r.source.get("session") == reading.entry.session
-    ]
+    of_part = (reading.files[0], reading.entry.session)
+    parts = [r for r in checked if (campaign.recorded / r.source["file"], r.source.get("session")) == of_part]
     if [part.name for part in parts] == [reading.name]:
         return [*_topics(reading), *facts(parts[0], reading.sensor_model)]
     whole = reading.recording()

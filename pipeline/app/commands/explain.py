@@ -124,10 +124,8 @@ def find(
     absent = [unit for unit in units if unit not in files and unit not in failures]
     if absent:
         known = ", ".join(sorted([*files, *failures])[:12])
-        raise MissingInputError(
-            f"no diagnosis of unit {', '.join(absent)}; there are those of {known or 'no unit'}",
-            str(folder / "diagnoses"),
-        )
+        message = f"no diagnosis of unit {', '.join(absent)}; there are those of {known or 'no unit'}"
+        raise MissingInputError(message, str(folder / "diagnoses"))
     wanted = [unit for unit in files if not units or unit in units]
     diagnoses = {unit: _json(files[unit]) if read else {} for unit in wanted}
     for unit, document in diagnoses.items():

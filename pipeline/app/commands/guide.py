@@ -272,11 +272,8 @@ def _next(progress: GuideProgress, goal: float, dwell: float) -> tuple[bool, lis
     """Return whether the goal is reached, and the next rest in words."""
     held = sum(progress.held_out)
     count = f"{progress.used} rests of the fit, {held} held out"
-    now = (
-        f"not determined yet: {progress.reason.partition(': ')[0]}"
-        if progress.reason
-        else f"{1e3 * progress.expanded:.3g} mg"
-    )
+    reason = f"not determined yet: {progress.reason.partition(': ')[0]}" if progress.reason else ""
+    now = reason or f"{1e3 * progress.expanded:.3g} mg"
     lines = [f"expanded uncertainty: {now} ({count}; goal {1e3 * goal:.3g} mg)"]
     proposal = propose(progress, goal)
     if not proposal.further:

@@ -58,13 +58,11 @@ def main(argv: Sequence[str]) -> int:
     bench = described({"sensor": sensor_name, "table": table_name, "procedure": procedure_name})
     unit = UnitDescription(arguments.unit, **bench)
     sheet = procedure.get("sheet")
-    text = (
-        template("listed_readme.md").render(
-            unit=arguments.unit, sensor=sensor_name, turn_deg=f"{procedure['turns']['accuracy_deg']:g}"
-        )
-        if sheet
-        else readme(unit, arguments.directory.resolve().name)
-    )
+    if sheet:
+        turn_deg = f"{procedure['turns']['accuracy_deg']:g}"
+        text = template("listed_readme.md").render(unit=arguments.unit, sensor=sensor_name, turn_deg=turn_deg)
+    else:
+        text = readme(unit, arguments.directory.resolve().name)
     if ranges != _ranges_of(data_sheets):
         text += "\nThe sizes apply to the ranges in the sensor file; campaign.yaml states the ranges of this bench.\n"
     folder = arguments.directory / procedure["folder"].replace("{unit}", arguments.unit)

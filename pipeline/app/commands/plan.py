@@ -72,12 +72,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--unit", default=None, metavar="NAME", help="a unit of the description (default: the first)")
     add("--effect", dest="effects", action="append", type=Path, default=[], metavar="FILE",
         help="an effect of your own (YAML); those of the campaign are always included")  # fmt: skip
-    add(
-        "--against",
-        default=None,
-        metavar="OPTIONS",
-        help="compare with a second procedure: the options in which it differs, in quotes",
-    )
+    words = "compare with a second procedure: the options in which it differs, in quotes"
+    add("--against", default=None, metavar="OPTIONS", help=words)
     add("--json", action="store_true", default=False, help="print the plan as JSON")
     add("--no-extra", dest="extra", action="store_false", default=True, help="do not propose additional recordings")
     add_recording_options(parser)
@@ -133,11 +129,5 @@ def _other(options: str, arguments: argparse.Namespace, first: UnitDescription) 
 
 
 def _of_gain(gain: PlanGain) -> dict[str, Any]:
-    return {
-        "what": gain.change.what,
-        "options": gain.change.options,
-        "minutes": gain.minutes,
-        "shows": list(gain.shown),
-        "tells_apart": list(gain.distinguished),
-        "size_factor": gain.factor,
-    }
+    found = {"what": gain.change.what, "options": gain.change.options, "minutes": gain.minutes}
+    return found | {"shows": list(gain.shown), "tells_apart": list(gain.distinguished), "size_factor": gain.factor}

@@ -27,11 +27,8 @@ Snakemake runs only stages whose inputs, settings or code have changed. Options 
 def main(argv: Sequence[str]) -> int:
     """Run ``imu-calibration run CAMPAIGN [OVERRIDE ...]``; return the exit code of Snakemake."""
     parser = parser_of("run", __doc__, EPILOG)
-    parser.add_argument(
-        "campaign",
-        metavar="CAMPAIGN",
-        help="directory of a campaign (./NAME in this one), or the name of a shipped campaign: demo, published",
-    )
+    words = "directory of a campaign (./NAME in this one), or the name of a shipped campaign: demo, published"
+    parser.add_argument("campaign", metavar="CAMPAIGN", help=words)
     parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="settings for every unit (Hydra overrides)")
     add_run_options(parser)
     words = "move results of another campaign of the same name to replaced-<date>/, and write those of this one"

@@ -65,11 +65,8 @@ class LogChecks:
         self.windows: list[dict[str, Values]] = []
         self.whole: dict[str, bool] = {}
         self.compensated = ""
-        self.ranges = {
-            key: (low, high)
-            for key, limits in (calibrated_range or {}).items()
-            for low, high in [limits if isinstance(limits, list) else (-np.inf, limits)]
-        }
+        limits = {key: v if isinstance(v, list) else [-np.inf, v] for key, v in (calibrated_range or {}).items()}
+        self.ranges = {key: (low, high) for key, (low, high) in limits.items()}
         self.soaked = self.ranges.pop(SOAKED, None)  # the temperatures within which a soak determined the bias
         if self.soaked:
             self.ranges[TEMPERATURE_RANGE] = self.soaked
@@ -94,11 +91,8 @@ class LogChecks:
         cells = [str(cell) for column in columns for cell in column[:CELLS].to_pylist()]
         decimals = [cell.partition(decimal)[2] for cell in cells if "e" not in cell.lower()]
         full = sum(len(text) == DECIMALS for text in decimals)
-        if (
-            len(decimals) >= LEAST_CELLS
-            and full > SHARE * len(decimals)
-            and not any(len(text) > DECIMALS or (len(text) == DECIMALS and text[-1] == "0") for text in decimals)
-        ):
+        known = len(decimals) >= LEAST_CELLS and full > SHARE * len(decimals)
+        if known and not any(len(text) > DECIMALS or (len(text) == DECIMALS and text[-1] == "0") for text in decimals):
             self.compensated = f"the readings have {DECIMALS} decimals, as this command writes them"
 
     def add(

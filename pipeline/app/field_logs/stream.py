@@ -287,11 +287,8 @@ class CsvLog:
             message = "the file is empty; expected a header with the names of the columns"
             raise InputError(message, f"{self.source}:1")
         self._find(head.names, f"{self.source}:{head.line}")
-        places = [
-            (self.columns[c], i)
-            for s, where in self.places.items()
-            for c, i in zip(CHANNELS_OF_SIGNALS[s], where, strict=True)
-        ]
+        pairs = ((c, i) for s, where in self.places.items() for c, i in zip(CHANNELS_OF_SIGNALS[s], where, strict=True))
+        places = [(self.columns[c], i) for c, i in pairs]
         self.layout = TextLayout(str(self.source), head.names, places, head.delimiter, self.settings.decimal)
         new = list(head.names)
         for sensor in (s for s in SENSORS if s in self.places):
@@ -383,11 +380,8 @@ def compensate_whole(files: Sequence[Path], out: Output, profile: LogProfile, st
         layouts = csv_formats(ingest)
         table = read_csv(files, [layouts[part] for part in sensor_parts(ingest)], checks_of(ingest))
     origin = int(table.time_ns[0]) if table.time_ns[0] > SINCE_1970_NS else 0
-    signals = {
-        s: profile.to_body(s, np.column_stack([table.values[c] for c in triad]))
-        for s, triad in TRIADS.items()
-        if triad[0] in table.values
-    }
+    present = {s: triad for s, triad in TRIADS.items() if triad[0] in table.values}
+    signals = {s: profile.to_body(s, np.column_stack([table.values[c] for c in triad])) for s, triad in present.items()}
     names = ["time", *(c for s in signals for c in TRIADS[s]), *(["temperature"] * ("temperature" in table.values))]
     signals |= {"time": (table.time_ns - origin) / 1e9}
     signals |= {"temperature": table.values["temperature"]} if "temperature" in table.values else {}

@@ -126,13 +126,8 @@ def of_sensor(
 ) -> Document:
     """Return the plan of one sensor; ``only``: of some effects."""
     noise = simulated.noise[sensor]
-    document: Document = {
-        "unit": unit_of(sensor),
-        "noise": {"white": float(noise.white[0]), "wander": float(noise.wander[0])},
-        "effects": [],
-        "not_observable": [],
-        "reason": None,
-    }
+    noises = {"white": float(noise.white[0]), "wander": float(noise.wander[0])}
+    document: Document = {"unit": unit_of(sensor), "noise": noises, "effects": [], "not_observable": [], "reason": None}
     limits: DetectionLimits
     try:
         if is_multi_position(sensor, simulated.recordings):
@@ -270,15 +265,9 @@ def plan_text(document: Document, second: Document | None = None) -> list[str]:
 
 def _rows(part: Mapping[str, Any]) -> list[list[str]]:
     """Return the plan of a sensor as a table; empty if no effect is observable."""
-    rows = [
-        [
-            entry["effect"],
-            size_text(entry["smallest"], entry["unit"]),
-            share_text(entry["share_of_limit"]),
-            "; ".join(filter(None, [_alike(entry), _note(entry)])),
-        ]
-        for entry in part["effects"]
-    ]
+    effects = part["effects"]
+    sizes = [[e["effect"], size_text(e["smallest"], e["unit"]), share_text(e["share_of_limit"])] for e in effects]
+    rows = [[*size, "; ".join(filter(None, [_alike(e), _note(e)]))] for size, e in zip(sizes, effects, strict=True)]
     return [["effect", "smallest size", "of limit", "similar signal; what would be named"], *rows] if rows else []
 
 

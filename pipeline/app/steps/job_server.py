@@ -19,11 +19,8 @@ from pipeline.app.steps.job_command import ADDRESS
 COMMAND = [sys.executable, "-PS", str(Path(__file__).with_name("job_command.py"))]  # imports no package
 # glibc returns freed memory to the system by default, which clears it when it is used again: 8 % of the stages' time.
 # Large pages save another 2 %, where the system lets a program ask for them.
-KEEP_FREED_MEMORY = {
-    "MALLOC_TRIM_THRESHOLD_": "500000000",
-    "MALLOC_MMAP_THRESHOLD_": "500000000",
-    "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
-}
+KEEP_FREED_MEMORY = dict.fromkeys(("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"), "500000000")
+KEEP_FREED_MEMORY |= {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
 
 
 def start_server() -> Callable[[], None]:

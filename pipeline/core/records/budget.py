@@ -29,12 +29,8 @@ NORMAL, RECTANGULAR = "normal", "rectangular"
 LIMIT = "not determined by the recordings: limit of the sensor file"  # a source of the uncertainty budget
 NOT_ESTIMATED = "not estimated by the method: "  # begins its remark where no stage estimates the elements that follow
 LACK_OF_FIT = "lack of fit"  # a part of the noise of the readings
-PART_NAMES = {
-    "white": "white noise",
-    "wander": "bias wander",
-    "lack_of_fit": LACK_OF_FIT,
-    "wander_and_scatter": "bias wander and scatter of the rests",
-}
+PART_NAMES = {"white": "white noise", "wander": "bias wander", "lack_of_fit": LACK_OF_FIT}
+PART_NAMES |= {"wander_and_scatter": "bias wander and scatter of the rests"}
 PLAIN = {float, str, int, bool, type(None)}  # types of most values of a record, which JSON holds unchanged
 MONTE_CARLO = "monte_carlo"  # key of the run in a published budget
 
@@ -141,13 +137,8 @@ class Parameters:
     def select(self, selected: slice | Index) -> Parameters:
         """Return the parameters at these places."""
         at = np.arange(len(self))[selected]
-        return Parameters(
-            tuple(self.names[k] for k in at),
-            tuple(self.units[k] for k in at),
-            self.values[at],
-            self.covariance[np.ix_(at, at)],
-            self.degrees_of_freedom[at],
-        )
+        names, units = tuple(self.names[k] for k in at), tuple(self.units[k] for k in at)
+        return Parameters(names, units, self.values[at], self.covariance[np.ix_(at, at)], self.degrees_of_freedom[at])
 
 
 @dataclass(frozen=True)
@@ -190,12 +181,9 @@ class BudgetLine:
 
     def at(self, rows: Sequence[int | None]) -> BudgetLine:
         """Return the line of some parameters, by their places; None: a parameter without an uncertainty."""
-        return replace(
-            self,
-            standard_uncertainty=_at(self.standard_uncertainty, rows),
-            degrees_of_freedom=_at(self.degrees_of_freedom, rows, np.inf),
-            parts=self.parts.mapped(lambda values: _at(values, rows)),
-        )
+        u, freedom = _at(self.standard_uncertainty, rows), _at(self.degrees_of_freedom, rows, np.inf)
+        parts = self.parts.mapped(lambda values: _at(values, rows))
+        return replace(self, standard_uncertainty=u, degrees_of_freedom=freedom, parts=parts)
 
     def to_json(self) -> dict[str, Any]:
         """Return the published line; the sensitivity is contribution / input uncertainty."""
@@ -296,11 +284,8 @@ class MonteCarlo:
 
     def at(self, rows: Sequence[int | None]) -> MonteCarlo:
         """Return the run of some parameters; None: one without an uncertainty."""
-        arrays: dict[str, Any] = {
-            key: _at(values, rows, key == "validated")
-            for key, values in vars(self).items()
-            if isinstance(values, np.ndarray)
-        }
+        values = {key: values for key, values in vars(self).items() if isinstance(values, np.ndarray)}
+        arrays: dict[str, Any] = {key: _at(each, rows, key == "validated") for key, each in values.items()}
         return replace(self, **arrays)
 
     def to_json(self) -> dict[str, Any]:
@@ -338,11 +323,8 @@ class Budget:
     def at(self, rows: Sequence[int | None]) -> Budget:
         """Return the budget of some parameters, by their places; None: a parameter without an uncertainty."""
         run = self.monte_carlo
-        return replace(
-            self,
-            lines=tuple(line.at(rows) for line in self.lines),
-            monte_carlo=run.at(rows) if isinstance(run, MonteCarlo) else run,
-        )
+        run = run.at(rows) if isinstance(run, MonteCarlo) else run
+        return replace(self, lines=tuple(line.at(rows) for line in self.lines), monte_carlo=run)
 
     def to_json(self, parameters: Parameters) -> dict[str, Any]:
         """Return the published budget; ``parameters``: of the calibration."""
@@ -361,11 +343,9 @@ class Budget:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
         """Return the object from the value of ``to_json``."""
-        return cls(
-            tuple(map(BudgetLine.from_json, data.get("contributions", ()))),
-            tuple(NotIncluded(**entry) for entry in data.get("not_included", ())),
-            _run_from_json(data.get(MONTE_CARLO)),
-        )
+        lines = tuple(map(BudgetLine.from_json, data.get("contributions", ())))
+        left_out = tuple(NotIncluded(**entry) for entry in data.get("not_included", ()))
+        return cls(lines, left_out, _run_from_json(data.get(MONTE_CARLO)))
 
 
 def _at(values: Values, rows: Sequence[int | None], absent: float = 0.0) -> Values:

@@ -195,15 +195,8 @@ def _fit_triangular(task: StageInput) -> SensorCalibration:
     covariance = PLACED @ fitted.covariance @ PLACED.T
     freedom = float(fitted.degrees_of_freedom.min())
     gain = (ScaledColumns.of(solved.columns).weights() * solved.share)[:, solved.rows]
-    return after_stage(
-        before,
-        _stage(rows, solved, covariance, freedom),
-        solved.model,
-        fitted,
-        settings,
-        white=PLACED @ np.sum(gain**2, axis=1),
-        not_included=OF_LENGTH,
-    )
+    stage, white = _stage(rows, solved, covariance, freedom), PLACED @ np.sum(gain**2, axis=1)
+    return after_stage(before, stage, solved.model, fitted, settings, white=white, not_included=OF_LENGTH)
 
 
 def _with_noise_of_means(rows: Orientations, solved: _Solved) -> Orientations:

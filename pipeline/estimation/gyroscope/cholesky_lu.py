@@ -90,11 +90,8 @@ from pipeline.estimation.uncertainty_budget import (
 from pipeline.physics.signal.rests import runs
 
 NAME = "cholesky_lu"
-FIT_STAGES = {
-    NAME: FitStage(
-        sensors=("gyroscope",), needs=("bias",), changes=("matrix",), accepts=("readings", "bias"), free=True
-    )
-}
+STAGE = FitStage(sensors=("gyroscope",), needs=("bias",), changes=("matrix",), accepts=("readings", "bias"), free=True)
+FIT_STAGES = {NAME: STAGE}
 DIFFERENCE_STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-9 of the derivative
 MOTION_SHARE = 0.01  # of the largest rate, above which the table turns
 MIN_RATE_DPS = 0.02  # five times Earth's rotation, which a log may contain

@@ -202,13 +202,9 @@ def fit(task: StageInput) -> SensorCalibration:
     result = StageResult(name, parameters, float(np.sqrt(np.mean(error**2))), tuple(found.steps), details)
     offset, matrix = found.contract()
     condition, columns = ScaledColumns.of(design).condition, design.shape[1]
-    calibration = SensorCalibration(
-        sensor="gyroscope",
-        bias=offset,
-        matrix=matrix,
-        stages=(*task.stages, result),
-        convergence=Convergence(0.0, condition, columns, columns, closed_form=True),
-    )
+    convergence = Convergence(0.0, condition, columns, columns, closed_form=True)
+    stages = (*task.stages, result)
+    calibration = SensorCalibration("gyroscope", offset, matrix, stages=stages, convergence=convergence)
 
     def results(errors: Values) -> Values:
         return np.array([chain(here + e)[BASE] for e in errors])

@@ -210,14 +210,9 @@ class AccelerometerModel:
             Z = term.columns(self.sensor, motion, state.K)
             return np.asarray((np.einsum("ij,jcp->icp", C, Z) / error[:, :, None]).reshape(3 * k, -1))
 
-        return EquationBlock(
-            (C @ (soaks.reading - z) / error).ravel(),
-            np.zeros((3 * k, BASE_COUNT)),
-            columns,
-            error.ravel(),
-            bias.reshape(3, 3 * k, t),
-            scattered=True,
-        )
+        residual, by_bias = (C @ (soaks.reading - z) / error).ravel(), bias.reshape(3, 3 * k, t)
+        nothing = np.zeros((3 * k, BASE_COUNT))
+        return EquationBlock(residual, nothing, columns, error.ravel(), by_bias, scattered=True)
 
     def specific_force(self, state: State, rests: Rests) -> tuple[Values, Values]:
         """Return the specific force of each rest, g, and v: (m, 3) arrays."""

@@ -84,11 +84,8 @@ def _multiples(
     """
     spans = [(int(rests.recording[j]), span) for _, j, span in spans_between(rests) if not rests.held_out[j]]
     bounded = {index for index, _ in spans}
-    spans += [
-        (index, slice(0, r.samples))
-        for index, r in enumerate(recordings)
-        if r.axis is not None and r.role == role and r.gyroscope is not None and index not in bounded
-    ]
+    others = ((i, r) for i, r in enumerate(recordings) if r.axis is not None and r.role == role and i not in bounded)
+    spans += [(i, slice(0, r.samples)) for i, r in others if r.gyroscope is not None]
     moves, chosen = [], []
     for index, span in spans:
         recording = recordings[index]
@@ -348,11 +345,8 @@ class TurnsByHand:
             (f"the axis of the turns about {axis} is", off, error, "procedure.turns.axis_accuracy_deg")
             for axis, off, error in zip(first, across, deviation[count::2], strict=True)
         ]
-        return [
-            f"{what} {off:.2g} deg off, {off / error:.1f} times {name} with noise and bias"
-            for what, off, error, name in turned
-            if off > DEPARTS * error
-        ]
+        far = [(what, off, off / error, name) for what, off, error, name in turned if off > DEPARTS * error]
+        return [f"{what} {off:.2g} deg off, {n:.1f} times {name} with noise and bias" for what, off, n, name in far]
 
     def _samples(self, state: State) -> tuple[Motion, Values]:
         """Return the motion of all samples, and ``v = y - b - z``."""

@@ -336,12 +336,9 @@ def prior_hypotheses(prior: WanderPrior, white: float, kinds: int) -> list[Noise
     pairs = zip((bias / white).tolist(), prior.log_belief(bias).tolist(), strict=True)
     # no scatter is stated, so that none at all is the likeliest
     none = float(np.log(NO_INSTABILITY_ODDS * (len(START_SCATTERS) - 1)))
-    hypotheses = [
-        NoiseHypothesis(Setting(ratio, prior.time, belief), level, none=none)
-        for ratio, belief in pairs
-        if np.isfinite(belief)
-        for level in product(START_SCATTERS, repeat=kinds)
-    ]
+    settings = [Setting(ratio, prior.time, belief) for ratio, belief in pairs if np.isfinite(belief)]
+    levels = list(product(START_SCATTERS, repeat=kinds))
+    hypotheses = [NoiseHypothesis(setting, level, none=none) for setting in settings for level in levels]
     steady_moves = [h for h in hypotheses if kinds > 1 and h.scatter[1] in {START_SCATTERS[0], START_SCATTERS[2]}]
     return hypotheses + [replace(h, direction=c) for h in steady_moves for c in START_SCATTERS[2:]]
 

@@ -38,7 +38,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -108,11 +107,8 @@ class Moves:
 
 def spans_between(rests: Rests) -> list[tuple[int, int, slice]]:
     """Return the samples between consecutive rests of one recording, with the numbers of both rests."""
-    return [
-        (i, j, slice(int(rests.span[i, 1]) - 1, int(rests.span[j, 0]) + 1))
-        for i, j in pairwise(range(len(rests.time)))
-        if rests.recording[i] == rests.recording[j]
-    ]
+    span, joined = rests.span, np.flatnonzero(rests.recording[1:] == rests.recording[:-1]).tolist()
+    return [(i, i + 1, slice(int(span[i, 1]) - 1, int(span[i + 1, 0]) + 1)) for i in joined]
 
 
 def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:

@@ -215,16 +215,9 @@ class SelectionByHand:
         rest = residual - raw @ step
         values = term.values + step
         uncertainty = np.sqrt(max(1.0, float(rest @ rest) / n) * np.sum(inverse**2, axis=1))
-        return Score(
-            term.effect.name,
-            gain - added * float(np.log(n)),
-            float(scipy.special.chdtrc(added, gain)),
-            added,
-            values,
-            uncertainty,
-            0,
-            plausible=within(values, uncertainty, self.limits[term.effect.name]),
-        )
+        name, p = term.effect.name, float(scipy.special.chdtrc(added, gain))
+        delta_bic, plausible = gain - added * float(np.log(n)), within(values, uncertainty, self.limits[name])
+        return Score(name, delta_bic, p, added, values, uncertainty, 0, plausible=plausible)
 
     def _refine(self, scored: CandidateScores, names: Sequence[str], before: float) -> None:
         """Fit the competing nonlinear candidates to their optimum, which one linear step may not reach."""
@@ -394,11 +387,8 @@ def _problem(selection: SelectionByHand, effects: Mapping[str, Effect]) -> Candi
     model, state = selection.model, selection.fits[-1].state
     configured = len(selection.base.state.terms)
     fitted = {term.effect.name: term for term in state.terms[configured:]}
-    listed = [
-        (name, term, weight)
-        for name, candidate in effects.items()
-        for term, weight in time_constants(candidate, model.sensor, fitted.get(name))
-    ]
+    constants = {name: time_constants(this, model.sensor, fitted.get(name)) for name, this in effects.items()}
+    listed = [(name, term, weight) for name, each in constants.items() for term, weight in each]
     equations = model.equations(state, [term for _, term, _ in listed])
     base = np.concatenate([equations.base, *equations.effects[:configured]], axis=1)
     pairs = zip(listed, equations.candidates, strict=True)

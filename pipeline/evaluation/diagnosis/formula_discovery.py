@@ -242,12 +242,8 @@ class Forms:
         spans, refined = self._spans, self._coarse()
         best = _best_of_each(map(ScoredForm, refined, self.gains(refined)))
         for spacing in SCAN_REFINEMENTS:
-            near = [
-                Form(factor, each.form.modulator)
-                for each in best
-                if each.form.factor.signal in spans
-                for factor in forms.finer(each.form.factor, spans[each.form.factor.signal], spacing)
-            ]
+            around = ((each.form.factor, each.form.modulator) for each in best if each.form.factor.signal in spans)
+            near = [Form(finer, by) for f, by in around for finer in forms.finer(f, spans[f.signal], spacing)]
             best = _best_of_each([*best, *map(ScoredForm, near, self.gains(near))])
         return _best_of_each([*best, *self._polynomials()])
 
@@ -263,12 +259,8 @@ class Forms:
         spans = self._spans
         turning = any(part.motion.axis is not None for part in self.selection.observations.parts)
         factors, modulators = forms.factors(spans, turning=turning), forms.modulators(spans)
-        pairs = [
-            Form(factor, modulator)
-            for modulator in modulators
-            for factor in factors
-            if modulator is None or factor.signal != modulator.signal or factor.kind == "step"
-        ]
+        able = ((f, m) for m in modulators for f in factors if m is None or f.signal != m.signal or f.kind == "step")
+        pairs = [Form(factor, modulator) for factor, modulator in able]
         rows = np.random.default_rng(0).integers(len(self.selection.observations.weight), size=PROBED)
         declared = [getattr(e, "declared", None) for e in catalogue().values() if self.sensor in e.sensors]
         terms = [term for each in declared if each for term in each.terms.values()]

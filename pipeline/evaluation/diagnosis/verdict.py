@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from pipeline.core.records import Agreement, Dependence, MovesError, SelectionErrors, SensorDiagnosis
 from pipeline.core.verdicts import MARK_AFTER_MOVES, Verdict, decided_words
@@ -283,15 +284,9 @@ def judged(diagnosis: SensorDiagnosis, e: VerdictInput) -> SensorDiagnosis:
     if e.given and verdict == Verdict.MISSING_EFFECT:
         effects = ", ".join(diagnosis.selected)
         step = f"calibrate these recordings by a method that fits, with effects.{e.sensor}=[{effects}]"
-    return replace(
-        diagnosis,
-        verdict=verdict,
-        reason=reason,
-        decided_by=figure,
-        given=e.given,
-        next_experiment=step or diagnosis.next_experiment,
-        override=diagnosis.override if _offered(verdict, diagnosis, e) else "",
-    )
+    told: dict[str, Any] = {"verdict": verdict, "reason": reason, "decided_by": figure, "given": e.given}
+    override = diagnosis.override if _offered(verdict, diagnosis, e) else ""
+    return replace(diagnosis, **told, next_experiment=step or diagnosis.next_experiment, override=override)
 
 
 def may_be_unknown(verdict: Verdict, e: VerdictInput) -> bool:

@@ -48,14 +48,8 @@ PLUS_MINUS = (
 def _environment() -> Templates:
     environment = Templates("diagnosis", FileSystemLoader(Path(__file__).parent / "templates"))  # no HTML
     environment.filters |= {"plain": plain, "listed": listed, "said": lambda answer: _said(Answer(**answer))}
-    environment.globals |= {
-        "is_fixed": is_fixed,
-        "figure_and_size": figure_and_size,
-        "heating_and_cooling": tuple(IN_WORDS),
-        "largest_by_unit": largest_by_unit,
-        "plus_minus": PLUS_MINUS,
-        "times_of": times_of,
-    }
+    environment.globals |= {f.__name__: f for f in (is_fixed, figure_and_size, largest_by_unit, times_of)}
+    environment.globals |= {"heating_and_cooling": tuple(IN_WORDS), "plus_minus": PLUS_MINUS}
     environment.globals |= {"stays": STAYS, "unchanged": UNCHANGED, "Verdict": Verdict}
     return environment
 

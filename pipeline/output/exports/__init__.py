@@ -96,13 +96,8 @@ class _Texts(FileSystemLoader):
 
 @cache
 def _environment() -> Templates:
-    environment = Templates(  # no HTML; each comment filter closes its own comments
-        "exports",
-        FileSystemLoader(TEMPLATES),
-        keep_trailing_newline=True,
-        undefined=StrictUndefined,
-        extensions=["jinja2.ext.do"],
-    )
+    kept = {"keep_trailing_newline": True, "undefined": StrictUndefined, "extensions": ["jinja2.ext.do"]}
+    environment = Templates("exports", FileSystemLoader(TEMPLATES), **kept)  # no HTML; a comment filter closes comments
     environment.filters |= {"comment": _comment, "json": _json, "yaml": _yaml, "numbers": _numbers}
     environment.globals |= {**TEMPLATE_FUNCTIONS, "plan_of": plan_of}
     return environment

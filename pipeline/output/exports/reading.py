@@ -69,12 +69,8 @@ CONVERSION_TOLERANCE = 1e-9  # g, deg/s or 1: smaller differences of a converted
 WALK_S = 100.0  # correlation time of the wander that represents a random walk: K = s sqrt(2 / T), for any T
 NUMBER = re.compile(r"\d+\.\d+(?:e[-+]?\d+)?")
 # The worked example: a tilted body that turns, above the reference temperature.
-SAMPLE: dict[str, Any] = {
-    "accelerometer": np.array([0.1, -0.2, 0.97]),
-    "gyroscope": np.array([10.0, -20.0, 30.0]),
-    "temperature": 35.0,
-    "time": 600.0,
-}
+SAMPLE: dict[str, Any] = {"accelerometer": np.array([0.1, -0.2, 0.97]), "gyroscope": np.array([10.0, -20.0, 30.0])}
+SAMPLE |= {"temperature": 35.0, "time": 600.0}
 
 
 @dataclass(frozen=True)
@@ -210,11 +206,8 @@ def _sensors_in(file: Path, declared: Format, content: Node) -> dict[str, dict[s
     """Return the expressions for the sensors in a file."""
     read_back, endings = declared.read_back, declared.sensor_endings
     expressions = {s: read_back["sensor"] for s in endings if file.stem.endswith(endings[s])} or read_back
-    return {
-        s: dict(expressions[s])
-        for s in SENSORS
-        if s in expressions and any(map(content.has, expressions[s]["where"].split(" | ")))
-    }
+    given = {s: expressions[s]["where"].split(" | ") for s in SENSORS if s in expressions}
+    return {s: dict(expressions[s]) for s, where in given.items() if any(map(content.has, where))}
 
 
 def _read(file: Path, format_name: str, declared: Format, content: Node, counts: Counts) -> ImportedCalibration:

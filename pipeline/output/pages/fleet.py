@@ -379,10 +379,8 @@ def runs_data(entries: Sequence[JSON], settings: JSON) -> JSON | None:
             short = [[run, _short(state, of)] for (run, state), of in zip(shown.items(), of_runs, strict=True)]
             units.append([unit, short])
     runs = [[e["run"], f"run {e['run']}, {times[e['run']]}: {_count(e)}"] for e in compared]
-    gone = [
-        {"unit": unit, "run": run, "effects": effects, "add": add_command(settings, unit, effects)}
-        for (unit, run), effects in dropped(entries).items()
-    ]
+    lost = dropped(entries).items()
+    gone = [{"unit": u, "run": run, "effects": e, "add": add_command(settings, u, e)} for (u, run), e in lost]
     return {"runs": runs, "units": units, "dropped": gone, "number": entries[-1]["run"]}
 
 

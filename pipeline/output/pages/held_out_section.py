@@ -43,12 +43,8 @@ from pipeline.physics.measurement import predicted_reading
 
 # held-out errors of diagnosis and validation that agree within this factor are shown as one series
 EQUAL_ERROR_FACTOR = 1.2
-SOURCES = {
-    "static": "the static recording",
-    "rests": "the rests",
-    "residual": "short windows of turns",
-    "data_sheet": "the sensor file",
-}
+SOURCES = {"static": "the static recording", "rests": "the rests", "residual": "short windows of turns"}
+SOURCES |= {"data_sheet": "the sensor file"}
 BEFORE_AFTER = (("c3", "before"), ("c2", "after"))
 SILENT = Noise(np.zeros(3), np.zeros(3), 100.0, "none")  # errors are drawn, not weighted
 # Factor between white noise and data sheet above which a cause is named: the digital filters of an MPU-6050 (5 to
@@ -104,11 +100,8 @@ def over_temperature(calibration: SensorCalibration, recordings: list[Recording]
 
 def checks(validation: JSON | None) -> list[JSON]:
     """Return each limit of the configuration and its result: ``sensor, name, value, limit, unit, pass``."""
-    return [
-        {**check, "sensor": sensor, "unit": "" if check["name"] == "scale_factor" else SENSOR_UNITS[sensor]}
-        for sensor in SENSORS
-        for check in ((validation or {}).get(sensor) or {}).get("limits") or []
-    ]
+    checks = ((s, check) for s in SENSORS for check in ((validation or {}).get(s) or {}).get("limits") or [])
+    return [{**c, "sensor": s, "unit": "" if c["name"] == "scale_factor" else SENSOR_UNITS[s]} for s, c in checks]
 
 
 def passes(calibration: JSON, validation: JSON | None) -> bool | None:
@@ -284,21 +277,12 @@ def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON |
         deviation = np.sqrt(white + allan_variance("gauss_markov", size, tau, time))
         layers.append(LineMark(tau, deviation, 3, "dashed"))
     mean = np.mean([part["allan"]["deviation"] for part in axes.values()], axis=0)
-    finding, caption, description = sentences(
-        "allan",
-        **_white(axes, density),
-        unit=unit,
-        noise=noise,
-        wander=wander,
-        mean=[(float(mean[k]), float(tau[k])) for k in (0, len(tau) // 2, -1)],
-    )
-    return chart(
-        Figure(f"{sensor}-allan", finding, caption, tuple(legend)),
-        description,
-        [Panel(layers, f"Allan deviation, {unit}", 190, logarithmic=True)],
-        "averaging time, s",
-        kind="log",
-    )
+    means = [(float(mean[k]), float(tau[k])) for k in (0, len(tau) // 2, -1)]
+    about = {**_white(axes, density), "unit": unit, "noise": noise, "wander": wander, "mean": means}
+    finding, caption, description = sentences("allan", **about)
+    panel = Panel(layers, f"Allan deviation, {unit}", 190, logarithmic=True)
+    figure = Figure(f"{sensor}-allan", finding, caption, tuple(legend))
+    return chart(figure, description, [panel], "averaging time, s", kind="log")
 
 
 def term_rows(noise: JSON | None) -> list[JSON]:
@@ -363,13 +347,8 @@ def _text(part: JSON | None) -> str:
 def _white(axes: JSON, density: float | None) -> JSON:
     """Return the white noise, its ratio to the sensor file's density with a likely cause, and the other terms."""
     terms = [part["terms"] for part in axes.values()]
-    names = {
-        name
-        for term in terms
-        for name, parts in term.items()
-        for part in (parts if isinstance(parts, list) else [parts])
-        if part["value"] is not None
-    }
+    listed = ((name, p if isinstance(p, list) else [p]) for term in terms for name, p in term.items())
+    names = {name for name, parts in listed for part in parts if part["value"] is not None}
     densities = [t["white"]["value"] for t in terms if t["white"]["value"]]
     white = float(np.sqrt(np.mean(np.square(densities)))) if densities else None
     stated = (density or 0.0) / np.sqrt(2.0)

@@ -30,18 +30,9 @@ MARK, LINK_MARK = "<!-- history -->", "<!-- history link -->"  # in templates/un
 NOTHING = "\N{EN DASH}"
 PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"))
 MINUS = "\N{MINUS SIGN}"
-TYPOGRAPHIC = {
-    "+-": "±",
-    " x noise": " × noise",
-    " x the l": " × the l",  # largest, least expected: ``pipeline.core.verdicts.FIGURES``
-    "delta BIC": "ΔBIC",
-    "degC": "°C",
-    "^2": "²",
-    "^3": "³",
-    "sqrt(Hz)": "√Hz",
-    "sqrt(s)": "√s",
-    "gauss markov": "Gauss-Markov",
-}
+# " x the l": largest, least expected (``pipeline.core.verdicts.FIGURES``)
+TYPOGRAPHIC = {"+-": "±", " x noise": " × noise", " x the l": " × the l", "delta BIC": "ΔBIC", "degC": "°C"}
+TYPOGRAPHIC |= {"^2": "²", "^3": "³", "sqrt(Hz)": "√Hz", "sqrt(s)": "√s", "gauss markov": "Gauss-Markov"}
 TEMPLATES = Path(__file__).parent / "templates"
 _sections: deque[tuple[JSON, Markup]] = deque(maxlen=2)  # budgets of both sensors of the last unit, and their sections
 PUBLISHED_DATA = re.compile(r'<script type="application/json" id="published">(.*?)</script>')  # in a campaign's page

@@ -50,11 +50,8 @@ OF_CALIBRATION = tuple(f"{s}_{c}" for c in REMARK_KINDS for s in SENSORS)
 OF_UNIT = ("left_out", "incomplete")  # ``incomplete``: written by ``gather``, which knows what no stage could make
 # the error of the vector, where the attitude is known, the next step where the verdict is not ``nothing_missing``, and
 # the figure that decided the verdict
-NEXT = tuple(
-    f"{s}_{c}"
-    for s in SENSORS
-    for c in ("vector_error_before", "vector_error_after", "vector_noise_floor", "next_step", "decided_by")
-)
+OF_NEXT = ("vector_error_before", "vector_error_after", "vector_noise_floor", "next_step", "decided_by")
+NEXT = tuple(f"{s}_{c}" for s in SENSORS for c in OF_NEXT)
 MOVES = "gyroscope_moves_over_noise"
 SUMMARY_COLUMNS = (
     *UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *OF_CALIBRATION, *OF_UNIT, *NEXT,

@@ -342,13 +342,9 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
         unit=unit,
         noise=NOISE_ALONE_RATIO,
     )
-    return chart(
-        Figure(f"{sensor}-{name}", finding, caption, (*AXES_LEGEND, ("c5", "model"))),
-        description,
-        panels,
-        "angle of the rate table, deg" if turns else "time, s",
-        kind="angle" if turns else "",
-    )
+    figure = Figure(f"{sensor}-{name}", finding, caption, (*AXES_LEGEND, ("c5", "model")))
+    label, kind = ("angle of the rate table, deg", "angle") if turns else ("time, s", "")
+    return chart(figure, description, panels, label, kind=kind)
 
 
 def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:
@@ -370,12 +366,8 @@ def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:
         text = ", ".join(f"{number(v, 2)} {unit_text(unit)}".rstrip() for unit, v in largest_by_unit(limits).items())
         shares = {key: v["value"] / stated[key] for key, v in limits.items() if np.isfinite(stated.get(key, np.inf))}
         share = max(shares.values(), default=None)
-        row: JSON = {
-            "effect": name,
-            "text": text,
-            "share": share,
-            "excluded": share is not None and share < EXCLUDED * prior_limit() and name not in open_effects,
-        }
+        excluded = share is not None and share < EXCLUDED * prior_limit() and name not in open_effects
+        row: JSON = {"effect": name, "text": text, "share": share, "excluded": excluded}
         if shares:
             most = limits[max(shares, key=shares.__getitem__)]
             row["label"] = f"{plain(name)}: below {number(most['value'], 2)} {unit_text(most['unit'])}".rstrip()
@@ -388,14 +380,9 @@ def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
     shown = [row for row in rows if row["share"]]
     if not shown:
         return None
-    finding, caption, _ = sentences(
-        "limits",
-        count=len(shown),
-        excluded=sum(row["excluded"] for row in shown),
-        others=len(shown) - MOST_LIMITS,
-        below=EXCLUDED * prior_limit(),
-        prior=prior_limit(),
-    )
+    excluded, prior = sum(row["excluded"] for row in shown), prior_limit()
+    counts = {"count": len(shown), "excluded": excluded, "others": len(shown) - MOST_LIMITS}
+    finding, caption, _ = sentences("limits", **counts, below=EXCLUDED * prior, prior=prior)
     points = [Point(row["label"], row["share"], 3) for row in shown[:MOST_LIMITS]]
     figure = Figure(f"{sensor}-limits", finding, caption)
     label = "upper limit over the data sheet's limit (logarithmic)"
@@ -493,14 +480,8 @@ def added_variable(sensor: str, found: JSON) -> Figure | None:
     what = best["parameter"] if len({p["parameter"] for p in shown["panels"]}) == 1 else "each parameter"
     slopes = "; ".join(dict.fromkeys(_coefficient(p) for p in shown["panels"]))
     x_unit = _column_unit(best["unit"], unit)
-    finding, caption, description = sentences(
-        "added_variable",
-        effect=effect,
-        coefficient=_coefficient(best),
-        slopes=slopes,
-        straight=straight,
-        scatter=scatter,
-    )
+    shown = {"coefficient": _coefficient(best), "slopes": slopes, "straight": straight, "scatter": scatter}
+    finding, caption, description = sentences("added_variable", effect=effect, **shown)
     figure = Figure(f"{sensor}-added-variable", finding, caption, (("c5", "slope = parameter"),))
     label = f"column of {what}, minus all other columns" + (f", {x_unit}" if x_unit else "")
     return chart(figure, description, panels, label)

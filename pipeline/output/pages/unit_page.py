@@ -134,12 +134,8 @@ def render(
 
 def found_mounting(calibration: JSON) -> JSON | None:
     """Return the recordings that gravity shows mounted otherwise than stated, and the overrides that state it."""
-    noted = {
-        i.get("recording", i.get("file")): note["settings"]
-        for i in calibration.get("inputs") or []
-        for note in i.get("notes") or []
-        if isinstance(note, dict) and note.get("settings")
-    }
+    notes = ((i, n) for i in calibration.get("inputs") or [] for n in i.get("notes") or [] if isinstance(n, dict))
+    noted = {i.get("recording", i.get("file")): n["settings"] for i, n in notes if n.get("settings")}
     groups = found_mountings([(calibration["unit"], noted)])
     return {"recordings": groups[0].recordings, "overrides": as_overrides(groups[0].ways)} if groups else None
 
@@ -241,12 +237,8 @@ def _sentences(words: Sequence[str], found: JSON) -> JSON:
     hidden = ("Upper limits", "Not observable", "Next experiment")  # in tables, and on the card
     further = [line for line in others if line not in why and not line.startswith(hidden)]
     step = str(found.get("next_experiment") or "")
-    return {
-        "verdict_words": verdict,
-        "why": why,
-        "further": further,
-        "next_step": "" if found.get("verdict") == Verdict.NOTHING_MISSING and step.startswith("none") else step,
-    }
+    nothing = found.get("verdict") == Verdict.NOTHING_MISSING and step.startswith("none")
+    return {"verdict_words": verdict, "why": why, "further": further, "next_step": "" if nothing else step}
 
 
 def files_read(inputs: list[JSON] | None) -> list[JSON]:

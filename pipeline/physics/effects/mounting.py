@@ -113,11 +113,8 @@ class _OfRecordings(DeclaredEffect):
 
     def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
         """Return the parameters of each recording, one recording after the other."""
-        return tuple(
-            EffectParameter(f"{name}{suffix}", "deg", f"{self.what}{suffix.replace('_', ' about body ')}, {name}")
-            for name in self.recordings
-            for suffix in self.suffixes
-        )
+        pairs = ((name, s, s.replace("_", " about body ")) for name in self.recordings for s in self.suffixes)
+        return tuple(EffectParameter(f"{name}{s}", "deg", f"{self.what}{about}, {name}") for name, s, about in pairs)
 
     def rotation(self, motion: Motion, values: Values) -> Values:
         """Return the rotation of the vectors in the body frame by a recording's parameters: (..., 3, 3) array."""

@@ -82,10 +82,8 @@ def apply_filter(recording: Recording, settings: Filter) -> Recording:
     if name == "none":
         return recording
     if recording.samples < 2:
-        raise InputError(
-            f"recording {recording.name} has {recording.samples} samples; a filter needs at least 2",
-            recording.source.get("file"),
-        )
+        message = f"recording {recording.name} has {recording.samples} samples; a filter needs at least 2"
+        raise InputError(message, recording.source.get("file"))
     sections, run = _filter_of(recording, settings)
     zero_phase, interval = settings.zero_phase, recording.interval
     return recording.with_readings(

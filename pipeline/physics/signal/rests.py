@@ -358,11 +358,8 @@ def _reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
         usual = recording.source.get(RATE_AT_REST) or median(means[first : first + NEIGHBOUR_RESTS])
         off = float(np.max(np.abs(means[i] - usual)))
         noise = float(np.max(part.std(axis=0))) / np.sqrt(len(part))
-        reasons.append(
-            f"angular rate is {off:.2f} deg/s off that of other rests (limit {RATE_LIMIT_DPS:g} deg/s)"
-            if off > max(RATE_LIMIT_DPS, SIGNIFICANT_REST_DEVIATIONS * noise)
-            else ""
-        )
+        text = f"angular rate is {off:.2f} deg/s off that of other rests (limit {RATE_LIMIT_DPS:g} deg/s)"
+        reasons.append(text if off > max(RATE_LIMIT_DPS, SIGNIFICANT_REST_DEVIATIONS * noise) else "")
     return reasons
 
 

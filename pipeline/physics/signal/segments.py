@@ -204,11 +204,8 @@ def _find_segments(recording: Recording) -> list[Segment]:
     segments = [segment for group in session.groups for segment in session.segments(group)]
     segments += session.static(segments)
     if not any(s.axis for s in segments):
-        raise InputError(
-            f"no turns about one axis were found in {len(session.moves)} moves of the table; give windows in "
-            "procedure.recordings",
-            recording.source.get("file"),
-        )
+        message = f"no turns about one axis were found in {len(session.moves)} moves of the table"
+        raise InputError(f"{message}; give windows in procedure.recordings", recording.source.get("file"))
     return sorted(segments, key=lambda s: (s.start, s.role))
 
 
