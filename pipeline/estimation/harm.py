@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
+from typing import Self
 
 import numpy as np
 import scipy
@@ -79,32 +80,55 @@ def _raises(before: Values, after: Values, shared: float = 0.0, comparisons: int
     return bool(np.mean(change) > limit * np.sqrt(np.var(change, ddof=1) / m + shared))
 
 
-def harmful_on_held_out(names: Sequence[str], errors: Sequence[Values], time: Values, noise: Noise) -> dict[str, str]:
+@dataclass(frozen=True)
+class InPieces:
+    """The errors of a calibration in successive pieces of held-out motion."""
+
+    square: Values  # (k,), mean squared error of each piece
+    mean: Values  # (k, 3), mean error of the vector, or (k, 1), of the magnitude
+    rms: float  # of all samples
+
+    @classmethod
+    def of(cls, error: Values) -> Self:
+        """Return n errors in pieces: (n, 3) or (n, 1) array."""
+        squares = np.einsum("ij,ij->i", error, error)
+        mean = [np.full(len(part), 1.0 / len(part)) @ part for part in pieces(error)]
+        return cls(np.array([part.mean() for part in pieces(squares)]), np.array(mean), float(np.sqrt(squares.mean())))
+
+
+def pieces(values: Values) -> list[Values]:
+    """Return the values of successive samples, (n, ...), in ``HELD_OUT_PIECES`` parts or, of fewer samples, in n."""
+    return np.array_split(values, min(HELD_OUT_PIECES, len(values)))
+
+
+def harmful_on_held_out(names: Sequence[str], errors: Sequence[InPieces], time: Values, noise: Noise) -> dict[str, str]:
     """Return the effects that raise the error on held-out motion, with the reason; ``time``: (n,), s.
 
-    ``errors``: before effects are added, and with each further one: (n, 3) of vectors or (n, 1) of magnitudes.
+    ``errors``: before effects are added, and with each further one.
     """
-    count = min(HELD_OUT_PIECES, len(time))
-    squares = [np.array([p.mean() for p in np.array_split(np.einsum("ij,ij->i", e, e), count)]) for e in errors]
-    start, end = (np.array([p[k] for p in np.array_split(time, count)]) for k in (0, -1))
+    start, end = (np.array([part[k] for part in pieces(time)]) for k in (0, -1))
     correlation = block_covariance(start, end - start, noise.correlation_time)
-    variance = noise.wander**2 if errors[0].shape[1] > 1 else np.mean(noise.wander**2)
+    variance = noise.wander**2 if errors[0].mean.shape[1] > 1 else np.mean(noise.wander**2)
 
     def shared(before: int, after: int) -> float:
         """Return the variance of ``2 mean(d^T m)`` by the wander m, with the change d of the calibrated readings."""
-        change = np.array([2.0 * p.mean(axis=0) for p in np.array_split(errors[after] - errors[before], count)])
-        return float(np.sum(change * (correlation @ change) * variance)) / count**2
+        change = 2.0 * (errors[after].mean - errors[before].mean)
+        return float(np.sum(change * (correlation @ change) * variance)) / len(start) ** 2
 
-    return harmful(names, squares, "on held-out motion", shared)
+    return harmful(names, [each.square for each in errors], "on held-out motion", shared)
 
 
 def fits_of(selection: Selection, left_out: Collection[str] = ()) -> list[JointFit]:
-    """Return the fits of the base, without some of its effects, and with each further selected effect."""
+    """Return the fits of the base, without some of its effects, and with each further selected effect.
+
+    Those of the search are not fitted again.
+    """
     names, fit = selection.names, selection.fit
-    known = {} if left_out else {len(names): fit, 0: selection.base}
+    known = {} if left_out else {**selection.fits, tuple(names): fit, (): selection.base}
     base, of = [t for t in selection.base.terms if t.effect.name not in left_out], {t.effect.name: t for t in fit.terms}
     terms = [[*base, *(of[name] for name in names[:count])] for count in range(len(names) + 1)]
-    return [known.get(k) or fit_terms(selection.observations, t, fit, selection.settings) for k, t in enumerate(terms)]
+    steps = [(tuple(names[:count]), each) for count, each in enumerate(terms)]
+    return [known.get(k) or fit_terms(selection.observations, each, fit, selection.settings) for k, each in steps]
 
 
 def harmful_in_turns(selection: Selection, fits: Sequence[JointFit]) -> dict[str, str]:

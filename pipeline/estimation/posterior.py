@@ -27,7 +27,7 @@ import scipy
 
 from pipeline.core.records import BASE_COUNT, Values
 from pipeline.estimation.candidates import SECOND, SECOND_SHARE, time_constants
-from pipeline.estimation.design import Design, EffectColumns, placed
+from pipeline.estimation.design import EffectColumns, placed
 from pipeline.estimation.evidence import (
     LIMIT_SCALES,
     NEGLIGIBLE_MIXTURE_WEIGHT,
@@ -431,8 +431,8 @@ def _versions(sensor: str, fit: JointFit, term: EffectColumns) -> list[tuple[Eff
 
 def _products(
     selection: Selection, fit: JointFit, listed: Sequence[tuple[str, EffectColumns, float]], known: int
-) -> tuple[Design, Values, Values, Values, list[slice]]:
-    """Return a design at a fit, the products of its base, those of the other columns, log determinants, and places.
+) -> tuple[Values, Values, Values, Values, list[slice]]:
+    """Return the columns' norms at a fit, the products of base and other columns, log determinants, and places.
 
     The base is projected out of the other columns. The places are those of the listed terms. If the fit has no effects,
     the products are those of the selection's ranking. ``known``: number of columns of the base.
@@ -440,7 +440,7 @@ def _products(
     ranking = selection.ranking
     places = {
         (term.effect.name, term.values.tobytes()): at
-        for term, at in zip(ranking.candidates, ranking.design.slices, strict=False)
+        for term, at in zip(ranking.candidates, ranking.slices, strict=False)
     }
     keys = [(name, term.values.tobytes()) for name, term, _ in listed]
     if fit.terms or any(key not in places for key in keys):
@@ -449,9 +449,9 @@ def _products(
         walks = random_walks(selection.settings).values()
         stacked, logarithms = design.products([WHITE_SETTING, *selection.settings, *walks])
         projected = without(stacked, np.arange(known))[:, known:, known:]
-        return design, stacked[:, :known, :known], projected, logarithms, design.slices[len(configured) :]
+        return design.sizes(), stacked[:, :known, :known], projected, logarithms, design.slices[len(configured) :]
     base, projected = ranking.stacked[:, :known, :known], ranking.with_walks.copy()
-    return ranking.design, base, projected, ranking.logarithms, [places[key] for key in keys]
+    return ranking.sizes, base, projected, ranking.logarithms, [places[key] for key in keys]
 
 
 def _problem(selection: Selection, fit: JointFit, candidates: Mapping[str, EffectColumns]) -> CandidateProblem:
@@ -462,9 +462,9 @@ def _problem(selection: Selection, fit: JointFit, candidates: Mapping[str, Effec
     versions = {name: _versions(observations.sensor, fit, candidate) for name, candidate in candidates.items()}
     listed = [(name, term, weight) for name, each in versions.items() for term, weight in each]
     known = BASE_COUNT + sum(len(term.values) for term in configured)
-    design, base, products, logarithms, places = _products(selection, fit, listed, known)
+    size, base, products, logarithms, places = _products(selection, fit, listed, known)
     settings = [WHITE_SETTING, *selection.settings, *random_walks(selection.settings).values()]
-    size = np.where(design.sizes() > 0.0, design.sizes(), 1.0)
+    size = np.where(size > 0.0, size, 1.0)
     base = base / np.outer(size[:known], size[:known])
     prior = np.array([s.prior for s in settings]) - 0.5 * (logarithms + np.linalg.slogdet(base)[1])
     pairs = zip(listed, places, strict=True)

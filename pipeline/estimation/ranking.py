@@ -91,13 +91,13 @@ class Ranking:
         design = Design(observations, [*configured, *self.candidates], fit.K, fit.scale, project=True)
         walks = [] if fit.terms else random_walks(settings).values()  # for the posterior at the same fit
         self.stacked, self.logarithms = design.products([*self.settings, *walks])
-        self.design, of_settings = design, slice(len(self.settings))
+        self.sizes, self.slices, of_settings = design.sizes(), design.slices, slice(len(self.settings))
         self.penalty = 0.5 * self.logarithms[of_settings] - np.array([setting.prior for setting in self.settings])
         known = BASE_COUNT + sum(s.stop - s.start for s in design.slices[: len(configured)])
         self.with_walks = without(self.stacked, np.arange(known))[:, known:, known:]
         self.projected = self.with_walks[of_settings]
         self.spans = [slice(s.start - known, s.stop - known) for s in design.slices[len(configured) :]]
-        size = np.where(design.sizes() > 0, design.sizes(), 1.0)[known:]
+        size = np.where(self.sizes > 0, self.sizes, 1.0)[known:]
         unit = self.projected[0] / (size[:, None] * size)
         self.blocks: list[Values] = [np.zeros(0)] * len(self.spans)
         for members in _by_size([span.stop - span.start for span in self.spans]):

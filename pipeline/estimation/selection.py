@@ -64,31 +64,35 @@ def select(
     """
     observations, grid = weighted(observations, noise), selection_grid(noise)
 
-    def searched(observations: Observations, near: Mapping[tuple[str, ...], JointFit]) -> Selection:
-        """Select effects by all rows of the observations; ``near``: fits to most of them, from which fits start."""
+    def models(observations: Observations) -> tuple[list[list[EffectColumns]], dict[str, EffectColumns]]:
+        """Return the starts of the base with configured effects, and the candidates."""
         starts, candidates = starts_of(configured, observations, known, accelerometer), {}
         for this in candidates_for(observations, configured):
             zeros = np.zeros(len(this.parameters(observations.sensor)))
             prior = prior_of(this, observations, accelerometer, configured)
             candidates[this.name] = EffectColumns(this, zeros, prior=prior)
+        return starts, candidates
 
-        def selected() -> Selection:
-            start, limits = ordinary_base(observations, noise), limits_of(observations.sensor, data_sheet)
-            base = fit_best(observations, starts, start, grid)
-            ranking = Ranking(observations, base, base, candidates, grid)
-            given = observations, noise, data_sheet, start, grid, limits, candidates
-            selection = Selection(*given, base, base, ranking, ranking, near=near)
-            if search:
-                selection.run()
-            return selection
+    def searched(observations: Observations, near: Mapping[tuple[str, ...], JointFit]) -> Selection:
+        """Select effects by all rows of the observations; ``near``: fits to most of them, from which fits start."""
+        starts, candidates = models(observations)
+        start, limits = ordinary_base(observations, noise), limits_of(observations.sensor, data_sheet)
+        base = fit_best(observations, starts, start, grid)
+        ranking = Ranking(observations, base, base, candidates, grid)
+        given = observations, noise, data_sheet, start, grid, limits, candidates
+        selection = Selection(*given, base, base, ranking, ranking, near=near)
+        if search:
+            selection.run()
+        return selection
 
-        models = [[*candidates.values()], *starts]
-        key = select, tuple(tuple(term.key for term in terms) for terms in models), data_sheet.model_dump_json(), search
-        return observations.once(key, selected)
+    def selected() -> Selection:
+        selection = searched(observations, {})
+        remaining = without_unknown_motion(observations, selection.fit.terms)
+        return selection if remaining is observations else searched(remaining, selection.fits)
 
-    selection = searched(observations, {})
-    remaining = without_unknown_motion(observations, selection.fit.terms)
-    return selection if remaining is observations else searched(remaining, selection.fits)
+    starts, candidates = models(observations)
+    terms = [tuple(term.key for term in terms) for terms in ([*candidates.values()], *starts)]
+    return observations.once((select, *terms, data_sheet.model_dump_json(), search), selected)
 
 
 @dataclass

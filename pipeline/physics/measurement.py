@@ -33,6 +33,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -49,6 +50,7 @@ Truths = dict[str, Values]
 MAX_INVERSION_ITERATIONS = 60  # two digits a round: far more than 1e-13 needs
 INVERSION_TOLERANCE = 1e-13  # relative: some hundred roundings of a double
 OUT_OF_REACH = 1e12  # g or deg/s: far beyond any reading, the fixed point diverges
+SAMPLES_AT_ONCE = 20_000  # 480 kB an array of three axes
 STRETCH = 4.0  # memories: exp(4) costs two digits of the sums; shorter stretches cost time
 MAX_MEMORIES_BACK = 50.0  # memories that time may go back: exp(50) of the sums is still far from overflow
 DEGENERATE = 1e-15  # determinant over its scale, below which doubles do not resolve a slope
@@ -78,10 +80,15 @@ class SensorEffects:
         return cls(calibration, tuple((effect_of(e), e.values) for e in effects), inverse_of(calibration))
 
     def take_off(self, reading: Values, motion: Motion) -> Values:
-        """Subtract the effects at a motion from readings: (n, 3) array, g or deg/s."""
-        for effect, values in self.effects:
-            reading = reading - effect.reading(self.calibration.sensor, motion, self.K, values)
-        return reading
+        """Subtract the effects at a motion from readings: (n, 3) array, g or deg/s; those of a long log in parts."""
+        n, rest = len(reading), reading.copy()
+        if n > SAMPLES_AT_ONCE:
+            motion = motion.changed(direction=partial(turning_direction, motion))
+        for at in (slice(first, first + SAMPLES_AT_ONCE) for first in range(0, n, SAMPLES_AT_ONCE)):
+            here = motion if n <= SAMPLES_AT_ONCE else motion.part(at)
+            for effect, values in self.effects:
+                rest[at] -= effect.reading(self.calibration.sensor, here, self.K, values)
+        return rest
 
 
 def predicted_reading(calibration: SensorCalibration, motion: Motion) -> Values:
@@ -158,9 +165,8 @@ def linear_truth(calibration: SensorCalibration, reading: Values) -> Values:
 
     The three products of a row are added in a fixed order, so that no rounding depends on the number of samples.
     """
-    rest = reading - calibration.bias
-    x, y, z = rest.T
-    truth = np.empty_like(rest)
+    x, y, z = np.subtract(reading.T, calibration.bias[:, None], out=np.empty((3, len(reading))))  # contiguous: faster
+    truth = np.empty((len(reading), 3))
     for c, (along_x, along_y, along_z) in enumerate(calibration.matrix.tolist()):
         np.add(along_x * x + along_y * y, along_z * z, out=truth[:, c])
     return truth

@@ -143,7 +143,8 @@ def test_the_change_of_a_held_out_error_by_wander_has_the_stated_variance(monkey
     rises = [np.mean(np.sum((m + change) ** 2 - m**2, axis=1)) for m in drawn]
     seen: list[float] = []
     monkeypatch.setattr(harm, "harmful", lambda _names, _squares, _what, shared: seen.append(shared(0, 1)))
-    errors, noise = np.array([drawn[0], drawn[0] + change]), Noise(0.01 * np.ones(3), wander, tau, "static")
+    errors = [harm.InPieces.of(each) for each in (drawn[0], drawn[0] + change)]
+    noise = Noise(0.01 * np.ones(3), wander, tau, "static")
     harm.harmful_on_held_out(["a"], errors, time, noise)
     assert np.sqrt(seen[0]) == pytest.approx(np.std(rises), rel=3.0 / np.sqrt(2 * rows))
 

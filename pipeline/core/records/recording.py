@@ -393,6 +393,12 @@ class Motion:
         deferred = {n: partial(later, n) for n in DEFERRED if n not in fields and vars(self)[n] is not None}
         return self.changed(**{n: change(v) for n, v in arrays.items()}, **deferred, **fields)
 
+    def part(self, at: slice) -> Motion:
+        """Return the motion at consecutive samples, without the trajectory; the deferred fields stay with this one."""
+        arrays = {n: v[at] for n, v in vars(self).items() if isinstance(v, np.ndarray) and n not in DEFERRED}
+        deferred = {n: partial(lambda n: getattr(self, n)[at], n) for n in DEFERRED if self.has(n)}
+        return self.changed(**arrays, **deferred, at_offset=None, at_lag=None)
+
     def select(self, index: NDArray[Any]) -> Motion:
         """Return the motion at some samples (a mask or integers), without the trajectory between samples."""
         if index.dtype == bool and index.all():  # without a copy
@@ -408,8 +414,10 @@ def motion_at_rest(time: NDArray[np.float64]) -> Motion:
 
 
 def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``a x b`` of (..., 3) arrays, in a third of the time of ``numpy.cross``."""
-    product: NDArray[np.float64] = a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
+    """Return ``a x b`` of (..., 3) arrays, in half of the time of ``numpy.cross``."""
+    product: NDArray[np.float64] = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    for c, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        np.subtract(a[..., j] * b[..., k], a[..., k] * b[..., j], out=product[..., c])
     return product
 
 
@@ -422,7 +430,10 @@ def continuous(attitude: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def conjugate_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the vector part of ``conj(p) q`` for quaternions of shape (n, 4): (n, 3)."""
-    return p[:, :1] * q[:, 1:] - q[:, :1] * p[:, 1:] - cross(p[:, 1:], q[:, 1:])
+    product = cross(p[:, 1:], q[:, 1:])
+    for c in range(3):
+        np.subtract(p[:, 0] * q[:, 1 + c] - q[:, 0] * p[:, 1 + c], product[:, c], out=product[:, c])
+    return product
 
 
 def attitude_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:

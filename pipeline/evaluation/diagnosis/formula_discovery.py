@@ -54,7 +54,7 @@ MIN_FURTHER_GAIN_SHARE = 0.02
 MAX_FORMULA_TERMS = 3  # as many as effects that a verdict believes at once (``BELIEVED``)
 REFINED = 16  # forms that are scored under every noise setting, and whose constants are scanned more finely
 SCAN_REFINEMENTS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
-ROWS_AT_ONCE = 8192  # whose products of columns are computed together: 20 MB
+ROWS_AT_ONCE = 1024  # whose products of columns are computed together: 16 MB for 100 columns of a model
 PROBED = 200  # rows; two forms whose values there are equal to 1e-9 are one
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
 OBSERVABLE_BY = {"temperature": "bias_temperature"}  # effect that is observable if the recordings vary the covariate
@@ -240,11 +240,13 @@ class Forms:
     def ranked(self) -> list[ScoredForm]:
         """Return the best form of each name, best score first."""
         spans, refined = self._spans, self._coarse()
+        of_coarse = dict(self._columns)
         best = _best_of_each(map(ScoredForm, refined, self.gains(refined)))
         for spacing in SCAN_REFINEMENTS:
             around = ((each.form.factor, each.form.modulator) for each in best if each.form.factor.signal in spans)
             near = [Form(finer, by) for f, by in around for finer in forms.finer(f, spans[f.signal], spacing)]
             best = _best_of_each([*best, *map(ScoredForm, near, self.gains(near))])
+        self._columns = of_coarse  # those of the finer constants would have as much memory again
         return _best_of_each([*best, *self._polynomials()])
 
     @cached_property
@@ -399,7 +401,8 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
         names = [*case.configured, form.name]
         register(form)
         try:
-            reselected = select(context.observations, names, noise, case.data_sheet, accelerometer=case.accelerometer)
+            apart = replace(context.observations, kept=None)  # no other step has the form
+            reselected = select(apart, names, noise, case.data_sheet, accelerometer=case.accelerometer)
         finally:
             forget(form.name)
         criterion = _criterion(reselected, terms)

@@ -337,12 +337,12 @@ def _held_out(
     calibrations = [calibration_of(fit, selection.observations, None) for fit in fits]
     before = case.calibration if last_fit(case.calibration).reference else calibrations[0]
     errors, time = errors_of([before, *calibrations], samples)
-    floor = None if errors[0].shape[1] == 1 else vector_noise_floor(calibrations[-1], samples)
+    floor = None if errors[0].mean.shape[1] == 1 else vector_noise_floor(calibrations[-1], samples)
     setting, wander = fits[-1].setting, fits[-1].setting.ratio * fits[-1].scale
     if np.mean(wander**2) > np.mean(noise.wander**2):
         noise = replace(noise, wander=wander, correlation_time=setting.time)
     return (
-        [float(np.sqrt(np.einsum("ij,ij", error, error) / len(error))) for error in errors[1:]],
+        [error.rms for error in errors[1:]],
         noise_floor(calibrations[-1], samples) if floor is None else floor,
         harmful_on_held_out(selection.names, [errors[0], *errors[2:]], time, noise),
     )

@@ -66,6 +66,7 @@ from pipeline.core.records import (
 )
 from pipeline.core.settings import Settings, Table
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, STATED_WIDTH, block_covariance
+from pipeline.estimation.harm import InPieces
 from pipeline.estimation.selection import INFLATED
 from pipeline.estimation.uncertainty_budget import DITHERED, covariance_without_reference
 from pipeline.evaluation.held_out.samples import OTHER_SENSOR, Samples, mean_squares, reference_vector
@@ -127,24 +128,28 @@ def last_error_of_magnitude(calibration: SensorCalibration, samples: Samples) ->
     return None if found is None else vector_errors([found], directed=False)[:, 0]
 
 
-def errors_of(calibrations: Sequence[SensorCalibration], samples: Sequence[Samples]) -> tuple[list[Values], Values]:
-    """Return the errors of calibrations, with the effects that can be subtracted, and the n times at which all are.
+def errors_of(calibrations: Sequence[SensorCalibration], samples: Sequence[Samples]) -> tuple[list[InPieces], Values]:
+    """Return the errors of calibrations, with the effects that can be subtracted, in pieces of the samples.
 
-    Those of a calibration are (n, 3), of the vector, if all samples have its direction, else (n, 1), of the magnitude.
+    They are of the vector, if all samples have its direction for all calibrations, else of the magnitude. Also the
+    times of the n samples at which all are known: (n,) array, s.
     """
 
-    def of(calibration: SensorCalibration, *, directed: bool) -> Values:
+    def of(calibration: SensorCalibration) -> Values:
         found = [with_known_effects(calibration, each) for each in samples]
         return vector_errors(found, directed=directed and all(true is not None for _, _, true in found))
 
-    errors = [of(calibration, directed=True) for calibration in calibrations]  # one by one: they may have 100 MB each
-    if len({each.shape[1] for each in errors}) > 1:
-        errors = [of(calibration, directed=False) for calibration in calibrations]
-    known = np.concatenate([each.known for each in samples])
-    for each in errors:
-        known &= np.isfinite(each).all(axis=1)
-    time = np.concatenate([each.time for each in samples])
-    return (errors if known.all() else [each[known] for each in errors]), time[known]
+    directed, known = True, np.concatenate([each.known for each in samples])
+    while True:
+        found, remaining = [], known.copy()
+        for calibration in calibrations:  # one by one: the errors of a long recording have 100 MB each
+            error = of(calibration)
+            remaining &= np.isfinite(error).all(axis=1)
+            found.append(InPieces.of(error if known.all() else error[known]))
+        alike = len({each.mean.shape[1] for each in found}) == 1
+        if alike and np.array_equal(remaining, known):
+            return found, np.concatenate([each.time for each in samples])[known]
+        directed, known = directed and alike, remaining
 
 
 def vector_errors(corrected: Sequence[Corrected], *, directed: bool) -> Values:

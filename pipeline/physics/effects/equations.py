@@ -118,10 +118,22 @@ class _OfTurns(DeclaredEffect):
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the columns of the turn axis, zeros for the others."""
         out = np.zeros((len(motion.time), 3, 3 * self.each))
-        if motion.axis is not None and motion.angle is not None and motion.rate is not None:
-            mine = out[:, :, self.each * motion.axis : self.each * (motion.axis + 1)]
-            mine[:] = np.stack(self.in_turn(sensor, motion, motion.axis, K), axis=2)
+        for parameter, column in self._columns(sensor, motion, K):
+            out[:, :, parameter] = column
         return out
+
+    def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return the sum of the columns of the turn axis."""
+        added = np.zeros((len(motion.time), 3))
+        for parameter, column in self._columns(sensor, motion, K):
+            added += column * values[parameter]
+        return added
+
+    def _columns(self, sensor: str, motion: Motion, K: Values) -> list[tuple[int, Values]]:
+        """Return index and column of the parameters of the turn axis; none outside a turn."""
+        if motion.axis is None or motion.angle is None or motion.rate is None:
+            return []
+        return [*enumerate(self.in_turn(sensor, motion, motion.axis, K), self.each * motion.axis)]
 
     def in_turn(self, sensor: str, motion: Motion, axis: int, K: Values) -> tuple[Values, ...]:
         """Return the column of each parameter in a turn about an axis: (n, 3) arrays."""
