@@ -307,13 +307,9 @@ class SensorResult:
     @classmethod
     def of(cls, part: Mapping[str, Any]) -> SensorResult:
         """Return the calibration from a sensor's part of ``calibrations/<unit>.json``."""
-        return cls(
-            part["unit"],
-            np.array(part["bias"]),
-            np.array(part["matrix"]),
-            {name: np.array(part["expanded_uncertainty"][name]) for name in ("bias", "matrix")},
-            {effect["name"]: effect["parameters"] for effect in part["effects"]},
-        )
+        expanded = {name: np.array(part["expanded_uncertainty"][name]) for name in ("bias", "matrix")}
+        effects = {effect["name"]: effect["parameters"] for effect in part["effects"]}
+        return cls(part["unit"], np.array(part["bias"]), np.array(part["matrix"]), expanded, effects)
 
 
 @dataclass(frozen=True, eq=False)

@@ -137,14 +137,9 @@ def publish(
     """
     finish_publishing(results)
     paths = [item.name for item in new.iterdir()] if paths is None else paths
-    plan = {
-        "inodes": {path: (new / path).lstat().st_ino for path in paths},
-        "again": again,
-        "keep": sorted(keep),
-        "before": {**_last_written(results), **written},
-        "every": "written" in _read_record(results, "")[1],  # whether ``before`` has every file
-        "written": _states(new),
-    }
+    plan = {"inodes": {path: (new / path).lstat().st_ino for path in paths}, "again": again, "keep": sorted(keep)}
+    plan |= {"before": {**_last_written(results), **written}, "written": _states(new)}
+    plan |= {"every": "written" in _read_record(results, "")[1]}  # whether ``before`` has every file
     write_atomically(new / PLAN_FILE, json.dumps(plan))
     flush_file_system(results)
     new.rename(results / COMPLETE)

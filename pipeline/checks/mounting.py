@@ -251,14 +251,9 @@ def _applied(
         detail = f"as stated, body {bench.up} always points up; the angle used is {bench.sense:+d} times the logged one"
     code, settings = ("N-FOUND", ways) if as_found else ("N-MOUNTING", ())
     notes.append(Note(code, recording.samples, 0, 0, detail, settings=settings))
-    return replace(
-        recording,
-        up=bench.up if bench.vertical else "",
-        sense=bench.sense,
-        table_angle=None if angle is None else bench.sense * angle + bench.offset,
-        table_rate=None if rate is None else bench.sense * rate,
-        notes=tuple(notes),
-    )
+    angle = None if angle is None else bench.sense * angle + bench.offset
+    rate, up = None if rate is None else bench.sense * rate, bench.up if bench.vertical else ""
+    return replace(recording, up=up, sense=bench.sense, table_angle=angle, table_rate=rate, notes=tuple(notes))
 
 
 def words(bench: TurnMounting) -> str:

@@ -327,13 +327,9 @@ def check_intervals(recordings: Sequence[Recording], limits: ChannelLimits) -> N
     middle = float(np.median([r.interval for r in recordings]))
     for recording in recordings:
         if what := _unit(recording.interval / middle, TIME_UNIT_FACTORS):
-            raise refusal(
-                recording,
-                "reference_time",
-                f"{limits.column(recording, 'time')} looks like {what}: the interval between samples is "
-                f"{recording.interval:.6g} s, and {middle:.6g} s in the unit's other recordings",
-                "correct ingest.csv.columns.time.unit",
-            )
+            both = f"{recording.interval:.6g} s, and {middle:.6g} s in the unit's other recordings"
+            message = f"{limits.column(recording, 'time')} looks like {what}: the interval between samples is {both}"
+            raise refusal(recording, "reference_time", message, "correct ingest.csv.columns.time.unit")
 
 
 def _in_blocks(turned: Values | None) -> Values | None:
@@ -387,10 +383,6 @@ def _wrong_rate(
 
 def _wrong_time(recording: Recording, limits: ChannelLimits, ratio: _Ratio, seen: str) -> IngestError:
     name, what = limits.column(recording, "time"), _unit(ratio.value, TIME_UNIT_FACTORS)
-    return refusal(
-        recording,
-        "reference_time",
-        f"{name} looks like {what}: {seen} {ratio.value:.4g} times the angle that the table turned over "
-        f"{place(recording, 0, recording.samples - 1)}",
-        "correct ingest.csv.columns.time.unit",
-    )
+    over = place(recording, 0, recording.samples - 1)
+    message = f"{name} looks like {what}: {seen} {ratio.value:.4g} times the angle that the table turned over {over}"
+    return refusal(recording, "reference_time", message, "correct ingest.csv.columns.time.unit")

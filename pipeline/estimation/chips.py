@@ -542,21 +542,14 @@ def _estimated(R: Values, estimate: ChipMounting, chips: Sequence[Chip]) -> dict
     parameters = {}
     for i, name in enumerate(names):
         kind = next(k for k in PRIORS if k in name)
-        parameters[name] = {
-            "value": float(factor[i] * values[i]),
-            "unit": MOUNTING_UNITS[kind],
-            "standard_uncertainty": float(standard[i]),
-            "expanded_uncertainty": float(expanded[i]),
-            "observable": bool(standard[i] <= OBSERVED * PRIORS[kind] * factor[i]),
-        }
-    return {
-        "rotation": R.tolist(),
-        "axes_rotation": None if axes is None else axes.tolist(),
-        "parameters": parameters,
-        "covariance": {"parameters": names, "values": covariance.tolist()},
-        "not_observable": _not_observable(estimate),
-        "uncertainty_budget": [{"source": e.source, "type": e.kind, "contribution": each} for e, each in of_sources],
-    }
+        observable = bool(standard[i] <= OBSERVED * PRIORS[kind] * factor[i])
+        about = {"value": float(factor[i] * values[i]), "unit": MOUNTING_UNITS[kind]}
+        of_u = {"standard_uncertainty": float(standard[i]), "expanded_uncertainty": float(expanded[i])}
+        parameters[name] = {**about, **of_u, "observable": observable}
+    budget = [{"source": e.source, "type": e.kind, "contribution": each} for e, each in of_sources]
+    found = {"rotation": R.tolist(), "axes_rotation": None if axes is None else axes.tolist(), "parameters": parameters}
+    found |= {"covariance": {"parameters": names, "values": covariance.tolist()}}
+    return found | {"not_observable": _not_observable(estimate), "uncertainty_budget": budget}
 
 
 def _of_vector(R: Values) -> Values:

@@ -320,12 +320,8 @@ def filtered_motion(motion: Motion, recording: Recording) -> Motion:
         assert moved is not None  # noqa: S101
         return filtered_motion(moved, recording)
 
-    return replace(
-        motion,
-        **signals,
-        at_offset=None if motion.at_offset is None else partial(at, motion.at_offset),
-        at_lag=None if motion.at_lag is None else partial(at, motion.at_lag),
-    )
+    offset, lag = motion.at_offset and partial(at, motion.at_offset), motion.at_lag and partial(at, motion.at_lag)
+    return replace(motion, **signals, at_offset=offset, at_lag=lag)
 
 
 def _filter_settled(motion: Motion, recording: Recording) -> Mask:

@@ -48,14 +48,10 @@ class Score:
     def refined(self, gain: float, samples: float, terms: Terms, covariance: Values, limit: Values | float) -> Score:
         """Return the score by a fit at the candidate's optimum; ``covariance``: see ``estimates``."""
         gain, (values, uncertainty) = max(gain, 0.0), estimates(terms, covariance)[self.name]
-        return replace(
-            self,
-            delta_bic=gain - self.parameters * float(np.log(samples)),
-            p_value=float(scipy.special.chdtrc(self.parameters, gain)),
-            values=values,
-            uncertainty=uncertainty,
-            plausible=within(values, uncertainty, limit),
-        )
+        delta_bic = gain - self.parameters * float(np.log(samples))
+        p, plausible = float(scipy.special.chdtrc(self.parameters, gain)), within(values, uncertainty, limit)
+        found = replace(self, delta_bic=delta_bic, p_value=p, plausible=plausible)
+        return replace(found, values=values, uncertainty=uncertainty)
 
 
 class Ranking:

@@ -89,13 +89,8 @@ def fit(task: StageInput) -> SensorCalibration:
         residual_rms=float(np.sqrt(np.mean(residuals**2))),
         details=replace(details, residual_rms=np.sqrt(np.mean(residuals**2, axis=0)).tolist()),
     )
-    found = SensorCalibration(
-        sensor=sensor,
-        bias=bias,
-        matrix=matrix,
-        stages=(*task.stages, result),
-        convergence=linear_convergence(root * X, root * (y - X @ beta), condition, rank),
-    )
+    convergence = linear_convergence(root * X, root * (y - X @ beta), condition, rank)
+    found = SensorCalibration(sensor, bias, matrix, stages=(*task.stages, result), convergence=convergence)
     bench = bench_effects(sensor, settings.table, recordings.filtered)
     if bench and not stated_priors(settings.table):  # else the stage ``effects`` fits them
         return fit_joint(sensor, recordings.filtered, bench, recordings.noises[sensor], settings, found)

@@ -208,14 +208,9 @@ class StageOutput:
         rms = float(np.sqrt(np.mean(self.residual**2)))
         correction = Subtract(self.bias), Multiply(matrix)
         result = StageResult(task.stage, {n: parameters[n] for n in self.estimated}, rms, correction, details)
-        found = SensorCalibration(
-            task.sensor,
-            self.bias,
-            matrix,
-            stages=(*task.stages, result),
-            convergence=linear_convergence(self.jacobian, self.residual, columns.condition, columns.rank),
-            at_limits=self._at_limits(task, gain, place, matrix),
-        )
+        convergence = linear_convergence(self.jacobian, self.residual, columns.condition, columns.rank)
+        stages, at_limits = (*task.stages, result), self._at_limits(task, gain, place, matrix)
+        found = SensorCalibration(task.sensor, self.bias, matrix, stages, convergence=convergence, at_limits=at_limits)
         return combined(found, lines, missing)
 
     def _by_rest(self, values: Values) -> Values:

@@ -69,15 +69,10 @@ def to_parquet(recordings: Sequence[Recording]) -> bytes:
         filled = [np.zeros(n, TYPES[name]) if v is None else v for n, v in zip(samples, found, strict=True)]
         arrays.append(_array(np.concatenate(filled, dtype=TYPES[name]), absent))
     sink = pa.BufferOutputStream()
-    parquet.write_table(
-        pa.Table.from_arrays(arrays, schema=schema) if recordings else schema.empty_table(),
-        sink,
-        row_group_size=ROW_GROUP,
-        compression="lz4",
-        use_dictionary=False,
-        column_encoding={n: PAGE_ENCODINGS[TYPES[n]] for n in names},
-        write_statistics=False,
-    )
+    table = pa.Table.from_arrays(arrays, schema=schema) if recordings else schema.empty_table()
+    encodings = {n: PAGE_ENCODINGS[TYPES[n]] for n in names}
+    options = {"compression": "lz4", "use_dictionary": False, "write_statistics": False}
+    parquet.write_table(table, sink, row_group_size=ROW_GROUP, column_encoding=encodings, **options)
     return sink.getvalue().to_pybytes()  # type: ignore[no-any-return]
 
 

@@ -289,18 +289,10 @@ def _entry(row: Mapping[str, str], path: str, line: int) -> RecordingFile:
     for column, refused, expected in checks:
         if refused:
             raise _refusal(f"column {column}: {row[column]!r}; {expected} is expected", path, line)
-    return RecordingFile.model_validate(
-        {
-            "file": row["file"],
-            "role": "validation" if ANSWERS[held_out] else "rests",
-            "axis": None,
-            "optional": False,
-            "kind": kind,
-            "direction": direction,
-            "angle_deg": angle,
-            "angle_accuracy_deg": accuracy,
-        }
-    )
+    of_turn = {"direction": direction, "angle_deg": angle, "angle_accuracy_deg": accuracy}
+    role = "validation" if ANSWERS[held_out] else "rests"
+    about = {"file": row["file"], "role": role, "axis": None, "optional": False, "kind": kind, **of_turn}
+    return RecordingFile.model_validate(about)
 
 
 def direction_of(text: str) -> list[float] | None:

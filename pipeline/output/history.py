@@ -88,14 +88,10 @@ def unit_state(
 
     ``overrides``: key to value; ``config``: section of the configuration to digest.
     """
-    state = {
-        "status": calibration.get("status"),
-        "error": (calibration.get("error") or {}).get("code"),
-        "config_sha256": calibration.get("config_sha256"),
-        "config": dict(config or {}),
-        "recordings": {f["file"]: _digest(f) for f in calibration.get("inputs") or []},
-        "overrides": dict(overrides),
-    }
+    error, files = (calibration.get("error") or {}).get("code"), calibration.get("inputs") or []
+    state = {"status": calibration.get("status"), "error": error, "config_sha256": calibration.get("config_sha256")}
+    recordings = {f["file"]: _digest(f) for f in files}
+    state |= {"config": dict(config or {}), "recordings": recordings, "overrides": dict(overrides)}
     for sensor in SENSORS:
         fitted = calibration.get(sensor)
         held_out, diagnosed = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}

@@ -29,12 +29,8 @@ Evaluate = Callable[[Mapping[str, Values]], Any]
 MAX_FORMULA_LENGTH, MAX_FORMULA_DEPTH, MAX_FORMULA_NODES, LARGEST_POWER = 500, 40, 200, 20.0
 MOVING = ("angular_rate", "angular_acceleration", "direction", "rate")
 _LIBRARY_FUNCTIONS = (np.sin, np.cos, np.tan, np.tanh, np.exp, np.log, np.sqrt)
-OPERATORS: dict[type[ast.operator], tuple[Callable[..., Any], str]] = {
-    ast.Add: (np.add, "+"),
-    ast.Sub: (np.subtract, "-"),
-    ast.Mult: (np.multiply, "*"),
-    ast.Div: (np.divide, "/"),
-}
+OPERATORS: dict[type[ast.operator], tuple[Callable[..., Any], str]] = {ast.Add: (np.add, "+")}
+OPERATORS |= {ast.Sub: (np.subtract, "-"), ast.Mult: (np.multiply, "*"), ast.Div: (np.divide, "/")}
 POWER_FUNCTIONS: dict[float, tuple[Callable[..., Any], str, str]] = {  # in C of a name, and of what is longer
     2.0: (np.square, "({0} * {0})", "imu_square({0})"),
     3.0: (lambda x: x * x * x, "({0} * {0} * {0})", "imu_cube({0})"),

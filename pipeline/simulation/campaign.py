@@ -134,14 +134,10 @@ class Environment:
 
 def random_environment(rng: np.random.Generator) -> Environment:
     """Return a room at about 25 degC (Sudsanguan 2019, 5.1) in which the unit warms up by a few degrees."""
-    return Environment(
-        ambient=25.0 + rng.uniform(-1.0, 1.0),
-        warm_up=rng.uniform(3.0, 6.0),
-        warm_up_time=rng.uniform(200.0, 400.0),
-        drift=0.3,  # of an air-conditioned room
-        periods=rng.uniform(1800.0, 7200.0, 2),
-        phases=rng.uniform(0.0, 2.0 * np.pi, 2),
-    )
+    ambient, warm_up, warm_up_time = 25.0 + rng.uniform(-1.0, 1.0), rng.uniform(3.0, 6.0), rng.uniform(200.0, 400.0)
+    periods, phases = rng.uniform(1800.0, 7200.0, 2), rng.uniform(0.0, 2.0 * np.pi, 2)
+    drift = 0.3  # of an air-conditioned room
+    return Environment(ambient, warm_up=warm_up, warm_up_time=warm_up_time, drift=drift, periods=periods, phases=phases)
 
 
 @dataclass(frozen=True)

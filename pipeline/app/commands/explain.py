@@ -229,12 +229,9 @@ def explain(
             "moves": moves_over_noise(validation),
             "by_hand": (validation.get("gravity_direction") or {}).get("reason", NO_HAND) != NO_HAND,
         })  # fmt: skip
-    text: str = template("explain.txt").render(
-        far=MARK_ABOVE_FLOORS,
-        far_after_moves=MARK_AFTER_MOVES,
-        turn_errors=turn_errors,
-        units=[*units, *({"name": unit, "failure": failure} for unit, failure in failures.items())],
-    )
+    units += [{"name": unit, "failure": failure} for unit, failure in failures.items()]
+    marks = {"far": MARK_ABOVE_FLOORS, "far_after_moves": MARK_AFTER_MOVES}
+    text: str = template("explain.txt").render(**marks, turn_errors=turn_errors, units=units)
     return "\n".join([*_wrapped(text.splitlines(), width), ""])
 
 

@@ -333,14 +333,10 @@ def _comparison(entry: Any, number: int, rows: SheetRows) -> JSON:  # noqa: ANN4
     sensors, pairs = _names(entry.get("sensors", list(SENSORS))), entry.get("pairs")
     if not set(sensors) <= set(SENSORS):
         raise SettingProblem(f"sensors: {' and '.join(SENSORS)} are known, got {', '.join(sensors)}")
-    return {
-        "title": str(entry.get("title") or f"Comparison {number}"),
-        "groups": groups,
-        "sensors": sensors,
-        "against": against,
-        "pairs": {u: ", ".join(_cell(rows, u, c) for c in _names(pairs)) for u in members} if pairs else None,
-        "x": _x(str(entry["x"]), members, _names(entry.get("by", [])), rows) if "x" in entry else None,
-    }
+    devices = {u: ", ".join(_cell(rows, u, c) for c in _names(pairs)) for u in members} if pairs else None
+    x = _x(str(entry["x"]), members, _names(entry.get("by", [])), rows) if "x" in entry else None
+    title = str(entry.get("title") or f"Comparison {number}")
+    return {"title": title, "groups": groups, "sensors": sensors, "against": against, "pairs": devices, "x": x}
 
 
 def _groups(entry: JSON, rows: SheetRows) -> list[JSON]:

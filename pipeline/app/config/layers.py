@@ -234,15 +234,10 @@ def load_layers(directory: Path, settings: Mapping[str, Any], sensors: Iterable[
         raise ConfigurationError(f"unit_overrides: {form} is the form (lists within are quoted), got {per_unit!r}")
     for name in (str(n) for n in per_unit if str(n) not in units_table.rows):
         raise ConfigurationError(f"unit_overrides: no unit {name!r} in units.csv{nearest(name, units_table.rows)}")
-    return Layers(
-        units_table,
-        file.model_copy(update={"overrides": units}),
-        [*in_file, *on_command_line],
-        _read_devices(directory, units_table),
-        command,
-        {str(name): as_list(v, f"unit_overrides of {name}") for name, v in per_unit.items()},
-        simulation,
-    )
+    of_units, of_run = file.model_copy(update={"overrides": units}), [*in_file, *on_command_line]
+    devices = _read_devices(directory, units_table)
+    stated = {str(name): as_list(v, f"unit_overrides of {name}") for name, v in per_unit.items()}
+    return Layers(units_table, of_units, of_run, devices, command, stated, simulation)
 
 
 def as_list(value: Any, where: str, what: str = LIST) -> list[str]:  # noqa: ANN401  (the user's)

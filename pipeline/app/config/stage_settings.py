@@ -117,18 +117,9 @@ def settings_of_jobs(
             output: _file(output, _content(campaign, rows, *stage, summaries), again(f"batches/{batch}/{output}.zip"))
             for output, stage in outputs.items()
         }
-    of_gather = {
-        "campaign": campaign.name,
-        "batches": campaign.batches,
-        "order": list(campaign.units),
-        "run": campaign.run_settings(),
-        "sections": sections,
-        "compare": campaign.compare,
-        "page": campaign.page,
-        "combine": campaign.combine,
-        "packed": campaign.packed,
-        "truths": {unit: str(campaign.truth(unit)) for unit in compared},
-    }
+    of_gather = {name: getattr(campaign, name) for name in ("batches", "compare", "page", "combine", "packed")}
+    of_gather |= {"campaign": campaign.name, "order": list(campaign.units), "run": campaign.run_settings()}
+    of_gather |= {"sections": sections, "truths": {unit: str(campaign.truth(unit)) for unit in compared}}
     files[CAMPAIGN] = {"gather": _file("gather", of_gather, again(""))}
     if campaign.combine == "lot":
         files[CAMPAIGN]["lots"] = _file("lots", {"batches": campaign.batches}, again("batches/lots.zip"))

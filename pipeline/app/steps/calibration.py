@@ -106,15 +106,10 @@ def calibration_document(  # noqa: PLR0917  (what a calibration is composed of)
         told = "; ".join(f"{sensor}: {reason}" for sensor, reason in reasons.items())
         raise CannotCalibrateError(f"no sensor could be calibrated. {told}")
     axes = {s: list(m) for s, m in axis_maps(settings.sensor).items()}
-    document = header(unit, settings) | {
-        "status": "ok",
-        "error": None,
-        "log": {"ingest": {"csv": settings.ingest.csv, "mcap": settings.ingest.mcap}, "axis_map": axes},
-        "inputs": inputs(checked),
-        "calibrated_range": calibrated_range(checked),
-        "not_calibrated": reasons,
-        "noise": _noise(checked, settings),
-    }
+    log = {"ingest": {"csv": settings.ingest.csv, "mcap": settings.ingest.mcap}, "axis_map": axes}
+    document = header(unit, settings) | {"status": "ok", "error": None, "log": log, "inputs": inputs(checked)}
+    document |= {"calibrated_range": calibrated_range(checked), "not_calibrated": reasons}
+    document |= {"noise": _noise(checked, settings)}
     hidden = {sensor: _hidden(diagnosis.get(sensor)) for sensor in SENSORS}
     for sensor, fit in fits.items():
         document[sensor] = None
@@ -228,16 +223,10 @@ def judged(sensor: str, fit: dict[str, Any], data_sheet: DataSheet) -> dict[str,
 
 def header(unit: str, settings: Settings) -> dict[str, Any]:
     """Return the part of a calibration document that does not depend on the fit."""
-    return {
-        "schema_version": SCHEMA_VERSION,
-        "unit": unit,
-        "status": None,
-        "error": None,
-        **{group: getattr(settings, group).name for group in ("sensor", "table", "procedure", "method")},
-        "methods": {sensor: settings.method.of(sensor) for sensor in SENSORS},
-        "config_sha256": settings.stated.config_sha256,
-        "software": dict(_software()),
-    }
+    names = {group: getattr(settings, group).name for group in ("sensor", "table", "procedure", "method")}
+    methods = {sensor: settings.method.of(sensor) for sensor in SENSORS}
+    found = {"schema_version": SCHEMA_VERSION, "unit": unit, "status": None, "error": None, **names, "methods": methods}
+    return found | {"config_sha256": settings.stated.config_sha256, "software": dict(_software())}
 
 
 @cache

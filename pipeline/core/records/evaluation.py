@@ -254,13 +254,10 @@ class Dependence:
 
     def to_json(self, *, searched: bool) -> dict[str, Any]:
         """Return the entry of ``unexplained``; ``searched``: a form was found for a dependence of the sensor."""
-        return {
-            "covariate": self.covariate,
-            "p_value": self.p_value,
-            **(vars(self.form) if self.form else {}),
-            **({} if self.delta_bic is None else {"delta_bic": self.delta_bic}),
-            **({"explained_by": self.explained_by} if searched else {}),
-        }
+        form = vars(self.form) if self.form else {}
+        gain = {} if self.delta_bic is None else {"delta_bic": self.delta_bic}
+        found = {"covariate": self.covariate, "p_value": self.p_value, **form, **gain}
+        return found | ({"explained_by": self.explained_by} if searched else {})
 
 
 @dataclass(frozen=True)

@@ -453,18 +453,11 @@ class Estimator:
     @cached_property
     def sinusoids(self) -> list[list[Sinusoid]]:
         """The sinusoid of each channel in each turn."""
-        return [
-            [
-                fit_sinusoid(
-                    turn.angle,
-                    turn.reading[:, channel],
-                    sides=channel != axis,
-                    where=f"accelerometer {AXES[channel]} in the turn about {AXES[axis]}",
-                )
-                for channel in range(3)
-            ]
-            for axis, turn in enumerate(self.turns)
-        ]
+        found = []
+        for axis, turn in enumerate(self.turns):
+            named = [(c, f"accelerometer {AXES[c]} in the turn about {AXES[axis]}") for c in range(3)]
+            found += [[fit_sinusoid(turn.angle, turn.reading[:, c], sides=c != axis, where=name) for c, name in named]]
+        return found
 
     def after(self, names: Sequence[str], start: CorrectedForces | None = None) -> CorrectedForces:
         """Return the output of stages; ``start``: output of the stage before the first."""

@@ -212,13 +212,10 @@ def _calibration(  # noqa: PLR0917  (of one stage)
 ) -> SensorCalibration:
     """Return the calibration after the stage; ``covariance``: of bias, matrix, S, T and M, (27, 27)."""
     factors, columns = factorise(A), ScaledColumns.of(U)
-    details = replace(
-        details,
-        turns=len(U),
-        orthonormality_error=float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
-        determinant_of_M=float(np.linalg.det(factors.M)),
-        condition=float(np.linalg.cond(U / np.linalg.norm(U, axis=0))),
-    )
+    M, condition = factors.M, float(np.linalg.cond(U / np.linalg.norm(U, axis=0)))
+    error, determinant = float(np.max(np.abs(M @ M.T - np.eye(3)))), float(np.linalg.det(M))
+    details = replace(details, turns=len(U), orthonormality_error=error, determinant_of_M=determinant)
+    details = replace(details, condition=condition)
     parameters = stage_parameters(_values(factors), covariance[AFTER_BASE, AFTER_BASE])
     stage = StageResult(NAME, parameters, rms, (Subtract(previous.bias), Multiply(matrix)), details)
     convergence = linear_convergence(U, Y - U @ A.T, columns.condition, columns.rank)

@@ -351,13 +351,8 @@ def limit_block(known: Mapping[str, float], columns: Values, state: State, unit:
     """
     u = np.array(list(known.values()))
     ideal = np.array([float(name in ONE) for name in known])
-    return EquationBlock(
-        (ideal - columns @ base_values(state.bias, state.matrix)) / u,
-        columns / u[:, None],
-        lambda term: np.zeros((len(u), len(term.values))),
-        unit * u,
-        stated=True,
-    )
+    residual, base, size = (ideal - columns @ base_values(state.bias, state.matrix)) / u, columns / u[:, None], len(u)
+    return EquationBlock(residual, base, lambda term: np.zeros((size, len(term.values))), unit * u, stated=True)
 
 
 def with_limits(limits: Mapping[str, float], solve: Callable[[Mapping[str, float]], tuple[Fitted, Values]]) -> Fitted:

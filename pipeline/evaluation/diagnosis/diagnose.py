@@ -439,13 +439,9 @@ def effective_noise(
         densities.append(entry)
     if not densities:
         return None
-    return {
-        "unit": f"{unit_of(calibration.sensor)}/sqrt(Hz)",
-        "recordings": [r.name for r, _ in errors],
-        "motion": _motion([r for r, _ in errors]),
-        "white": white,
-        "densities": densities,
-    }
+    used = [r for r, _ in errors]
+    about = {"unit": f"{unit_of(calibration.sensor)}/sqrt(Hz)", "recordings": [r.name for r in used]}
+    return about | {"motion": _motion(used), "white": white, "densities": densities}
 
 
 def _of_effect(calibration: SensorCalibration, samples: Samples, found: SensorDiagnosis, name: str) -> Values | None:

@@ -69,13 +69,9 @@ def columns_of(formulas: Iterable[str], sensor: str) -> Curves:
 
 def signals_of(motion: Motion) -> dict[str, Values | None]:
     """Return the signals of the formula language in a motion, without ``u``."""
-    found: dict[str, Values | None] = {
-        "time": motion.time,
-        "temperature": motion.temperature,
-        "angle": motion.angle,
-        "rate": motion.rate,
-        "speed": np.sqrt(np.einsum("ij,ij->i", motion.angular_rate, motion.angular_rate)),
-    }
+    found: dict[str, Values | None] = {"time": motion.time, "temperature": motion.temperature, "angle": motion.angle}
+    speed = np.sqrt(np.einsum("ij,ij->i", motion.angular_rate, motion.angular_rate))
+    found |= {"rate": motion.rate, "speed": speed}
     for c, axis in enumerate("xyz"):
         found[f"f{axis}"], found[f"w{axis}"] = motion.specific_force[:, c], motion.angular_rate[:, c]
     return found

@@ -71,18 +71,10 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
     by_reason: dict[str, list[str]] = {}
     for hidden in part["not_observable"]:
         by_reason.setdefault(hidden["reason"].split("; it needs ")[0], []).append(hidden["effect"])
-    text = template("diagnosis.txt").render(
-        part=part,
-        sensor=sensor,
-        unit=unit_of(sensor),
-        most_values=most_values,
-        entries={entry["effect"]: entry for entry in part["ranking"]},
-        catalogue=catalogue(),
-        by_reason=by_reason.items(),
-        answers=listed([*map(_said, sets[:MOST_ANSWERS]), *more], "or"),
-        fixed=FIXED_AT_ZERO,
-        tilt=TILT,
-    )
+    answers = listed([*map(_said, sets[:MOST_ANSWERS]), *more], "or")
+    about = {"part": part, "sensor": sensor, "unit": unit_of(sensor), "most_values": most_values, "answers": answers}
+    about |= {"catalogue": catalogue(), "entries": {entry["effect"]: entry for entry in part["ranking"]}}
+    text = template("diagnosis.txt").render(**about, by_reason=by_reason.items(), fixed=FIXED_AT_ZERO, tilt=TILT)
     return [line for line in text.splitlines() if line]
 
 

@@ -220,38 +220,22 @@ def _rendered(declared: Format, template: Template, exported: ExportedUnit) -> s
     available = {*sensors, "board"} if (exported.document.get("board") or {}).get("chips") else set(sensors)
     if without_counts or not set(declared.required) <= available:
         return None
-    return template.render(
-        **{s: sensors.get(s) for s in SENSORS},
-        sensors=sensors,
-        unit=exported.document["unit"],
-        document=exported.document,
-        sheets=exported.sheets,
-        gravity_g=exported.gravity_g,
-        noise=noise(exported.noise_figures) if declared.noise else None,
-        remarks=_remarks(declared, sensors, exported),
-    )
+    about = {key: getattr(exported, key) for key in ("document", "sheets", "gravity_g")}
+    about |= {"noise": noise(exported.noise_figures) if declared.noise else None, "sensors": sensors}
+    about |= {"unit": exported.document["unit"], "remarks": _remarks(declared, sensors, exported)}
+    return template.render(**{s: sensors.get(s) for s in SENSORS}, **about)
 
 
 def _remarks(declared: Format, sensors: dict[str, ExportedSensor], exported: ExportedUnit) -> list[str]:
     """Return the remarks in the file, each a sentence or a line."""
     included = [*declared.effects, *declared.effects_in_part]
-    text = text_of(
-        "remarks.txt",
-        declared=declared,
-        document=exported.document,
-        validation=exported.validation,
-        diagnosis=exported.diagnosis,
-        before_use=before_use(exported.document),
-        sensors=sensors,
-        counts={s: sensor.counts for s, sensor in sensors.items()},
-        lost={
-            s: [] if "all" in included else [name for name in sensor.effects if name not in included]
-            for s, sensor in sensors.items()
-        },
-        follows_temperature=any(sensor.follows_temperature for sensor in sensors.values()),
-        figures=exported.noise_figures if declared.noise else {},
-    )
-    return text.splitlines()
+    about = {key: getattr(exported, key) for key in ("document", "validation", "diagnosis")}
+    about |= {"declared": declared, "before_use": before_use(exported.document), "sensors": sensors}
+    about |= {"counts": {s: sensor.counts for s, sensor in sensors.items()}}
+    every, figures = "all" in included, exported.noise_figures if declared.noise else {}
+    lost = {s: [n for n in sensor.effects if n not in included and not every] for s, sensor in sensors.items()}
+    follows = any(sensor.follows_temperature for sensor in sensors.values())
+    return text_of("remarks.txt", **about, lost=lost, follows_temperature=follows, figures=figures).splitlines()
 
 
 def _comment(lines: list[str], mark: str = "# ", end: str = "\n", *, escape: tuple[str, str] = ("", "")) -> str:

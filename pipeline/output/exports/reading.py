@@ -338,13 +338,9 @@ def with_noise(sheets: Mapping[str, SensorFigures], imported: ImportedCalibratio
     for s, unit in SI.items():
         density, walk = (imported.noise.get(f"{s}_{what}") for what in ("noise_density", "random_walk"))
         if density is not None and walk is not None:
-            found[s] = replace(
-                sheets.get(s, SensorFigures()),
-                noise_density=np.sqrt(2.0) * density / UNIT_FACTORS[unit],  # one-sided
-                bias_wander=walk / UNIT_FACTORS[unit] * np.sqrt(WALK_S / 2.0),
-                wander_time_s=WALK_S,
-                noise_origin=f"as {imported.format_name} states it",
-            )
+            white = np.sqrt(2.0) * density / UNIT_FACTORS[unit]  # one-sided
+            wander, origin = walk / UNIT_FACTORS[unit] * np.sqrt(WALK_S / 2.0), f"as {imported.format_name} states it"
+            found[s] = SensorFigures(counts_of(sheets)[s], white, wander, WALK_S, origin)
     return found
 
 

@@ -298,29 +298,18 @@ def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:
         if measures:
             parameters = _parameters(units, against, pairs)
             sensors.append({"sensor": sensor, "unit": unit, "measures": measures, "parameters": parameters})
-    return {
-        "title": comparison["title"],
-        "against": against,
-        "paired": pairs is not None,
-        "sensors": sensors,
-        "groups": [(g["name"], g["units"]) for g in comparison["groups"]],
-        "single": all(len(g["units"]) == 1 for g in comparison["groups"]),
-    }
+    members = [(g["name"], g["units"]) for g in comparison["groups"]]
+    found = {"title": comparison["title"], "against": against, "paired": pairs is not None, "sensors": sensors}
+    return found | {"groups": members, "single": all(len(of) == 1 for _, of in members)}
 
 
 def _row(group: JSON, units: pd.DataFrame, compared: Compared, measure: str) -> JSON:
     """Return the row of a group and a measure on the page; ``units``: the figures of its calibrated units."""
     verdicts = units["verdict"]
-    return {
-        "name": group["name"],
-        "measure": measure,
-        "group": group,
-        "units": units,
-        "compared": compared,
-        "verdicts": verdicts[verdicts != ""].value_counts(sort=False),
-        "floor": _mean(units["noise_floor"]) if measure == "after" else None,
-        **{name: _mean(units[name]) for name in ("before", "table_time")},
-    }
+    about = {"name": group["name"], "measure": measure, "group": group, "units": units, "compared": compared}
+    floor = _mean(units["noise_floor"]) if measure == "after" else None
+    about |= {"verdicts": verdicts[verdicts != ""].value_counts(sort=False), "floor": floor}
+    return about | {name: _mean(units[name]) for name in ("before", "table_time")}
 
 
 def _mean(values: pd.Series[float]) -> float | None:

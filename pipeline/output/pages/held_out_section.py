@@ -141,16 +141,10 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, scale: Scale, *, vecto
         added = _steps_if_added(found, reached, scale.factor)
     kind = "vector" if vector else "magnitude"
     keys = ("source", "wander_source", "correlation_time_source") if "noise" in held_out else ()
-    finding, caption, _ = sentences(
-        "staircase",
-        kind=kind,
-        reached=reached,
-        floor=floor,
-        unit=unit,
-        added=f"{'' if _exact(found) else 'about '}{number(added[-1].value, added[-1].digits)}" if added else "",
-        held_out=held_out.get("held_out", True),
-        sources=[SOURCES[held_out["noise"][key]] for key in keys],
-    )
+    last = f"{'' if _exact(found) else 'about '}{number(added[-1].value, added[-1].digits)}" if added else ""
+    about = {"kind": kind, "reached": reached, "floor": floor, "unit": unit, "added": last}
+    about |= {"held_out": held_out.get("held_out", True), "sources": [SOURCES[held_out["noise"][key]] for key in keys]}
+    finding, caption, _ = sentences("staircase", **about)
     figure = Figure(f"{sensor}-staircase-{kind}", finding, caption)
     label = f"root mean square error, {unit} (logarithmic)"
     return bars(figure, rows + added, label, levels={f"noise floor {number(floor)}": floor or 0.0})

@@ -285,13 +285,9 @@ def _covariate(sensor: str, label: str, mean: _BinnedMean, wander: Values) -> Fi
             f"Not flat against {words}: {number(size)} {unit} on {AXES[worst]} at {number(at)} {covariate_unit}, "
             f"{number(sigmas, 2)} σ"
         )
-    return chart(
-        Figure(f"{sensor}-residual-{name.replace(' ', '-')}", finding, quiet=excess < FLAT),
-        f"Means in bins; on the worst axis their mean square is {number(excess)} times that of noise and wander.",
-        panels,
-        label,
-        kind="angle" if name == "angle" else "",
-    )
+    figure = Figure(f"{sensor}-residual-{name.replace(' ', '-')}", finding, quiet=excess < FLAT)
+    means = f"Means in bins; on the worst axis their mean square is {number(excess)} times that of noise and wander."
+    return chart(figure, means, panels, label, kind="angle" if name == "angle" else "")
 
 
 def _harmonics(sensor: str, name: str, amplitudes: Values, level: Values) -> Figure:
@@ -331,17 +327,9 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
     rms = np.sqrt(np.mean(residual.error**2, axis=0))
     ratio, outside = float((rms / sigma).max()), float(np.mean(np.abs(residual.error) > 2 * sigma))
     by_encoder = float(residual.reference_noise.max())
-    finding, caption, description = sentences(
-        "model",
-        name=name,
-        ratio=ratio,
-        outside=outside,
-        reference=(AXES[int(np.argmax(residual.reference_noise))], by_encoder) if known and by_encoder else None,
-        known=known,
-        rms=rms.tolist(),
-        unit=unit,
-        noise=NOISE_ALONE_RATIO,
-    )
+    by_reference = (AXES[int(np.argmax(residual.reference_noise))], by_encoder) if known and by_encoder else None
+    about = {"name": name, "ratio": ratio, "outside": outside, "reference": by_reference, "known": known}
+    finding, caption, description = sentences("model", **about, rms=rms.tolist(), unit=unit, noise=NOISE_ALONE_RATIO)
     figure = Figure(f"{sensor}-{name}", finding, caption, (*AXES_LEGEND, ("c5", "model")))
     label, kind = ("angle of the rate table, deg", "angle") if turns else ("time, s", "")
     return chart(figure, description, panels, label, kind=kind)
@@ -532,14 +520,11 @@ def unexplained(sensor: str, found: JSON) -> list[Figure]:
                 layers.insert(0, LineMark(curve_x, curve, 5, "model"))
                 scatter.append(float(np.mean(((mean - np.interp(x, curve_x, curve)) / error) ** 2)))
             panels.append(Panel(layers, f"{panel['axis']}, {unit}", 76, {"": 0.0}))
-        finding, caption, description = sentences(
-            "unexplained",
-            covariate=covariate,
-            entry=entries.get(covariate, {}),
-            fitted=bool(scatter),
-            follow=all(mean_square < ON_THE_LINE for mean_square in scatter),
-            reaches=[f"{p['axis']} up to {number(float(np.abs(p['mean']).max()))} {unit}" for p in shown["panels"]],
-        )
+        reaches = [f"{p['axis']} up to {number(float(np.abs(p['mean']).max()))} {unit}" for p in shown["panels"]]
+        about = {"covariate": covariate, "entry": entries.get(covariate, {}), "reaches": reaches}
+        about |= {"fitted": bool(scatter)}
+        follow = all(mean_square < ON_THE_LINE for mean_square in scatter)
+        finding, caption, description = sentences("unexplained", **about, follow=follow)
         legend = (("c5", "suggested shape"),) if scatter else ()
         figure = Figure(f"{sensor}-unexplained-{covariate}", finding, caption, legend)
         label = SIGNAL_NAMES.get(shown["signal"], f"what the axis should read, {SENSOR_UNITS[sensor]}")

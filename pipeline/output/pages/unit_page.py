@@ -85,12 +85,9 @@ def render(
     validation, diagnosis, words = validation or {}, diagnosis or {}, words or {}
     attitude, moves = validation.get("attitude") or {}, validation.get("gravity_direction") or {}
     ok, rests = calibration.get("status") == "ok", {r.name: rests_from_table(r) for r in recordings}
-    environment = {
-        "temperature": sensor_temperature(recordings),
-        "recorded_s": sum(_duration(r) for r in recordings if r.samples),
-        "table": settings.table,
-        "filter": settings.filter.name,
-    }
+    seconds = sum(_duration(r) for r in recordings if r.samples)
+    environment = {"temperature": sensor_temperature(recordings), "recorded_s": seconds, "table": settings.table}
+    environment |= {"filter": settings.filter.name}
     fits = {s: SensorCalibration.from_json(s, calibration[s]) for s in SENSORS if ok and calibration.get(s)}
     sensors = []
     for sensor in SENSORS if ok else ():
@@ -334,13 +331,11 @@ def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibrat
     finding = f"{count} rest{'s' if count != 1 else ''} in {len(drawn)} recording{'s' if len(drawn) != 1 else ''}"
     legend = tuple((f"c{c}", f"rest, {use}") for use, c in USES.items() if c in colours) or ((f"c{LOGGED}", "rest"),)
     names = [r.name if len(r.name) <= LETTERS else f"{r.name[: LETTERS - 1]}…" for r in lanes]
-    return chart(
-        Figure("segments", finding, "Thick: rests that were found; thin: the remaining time.", legend),
-        f"Rests of each recording. {'; '.join(f'{name}: {len(of)}' for name, of in spans.items())}.",
-        [Panel(layers, "", LANE * len(lanes), limits=(0.5, len(lanes) + 0.5), rows=names)],
-        "time since the start of the recording, s",
-        left=LEFT,
-    )
+    figure = Figure("segments", finding, "Thick: rests that were found; thin: the remaining time.", legend)
+    counts = "; ".join(f"{name}: {len(of)}" for name, of in spans.items())
+    panel = Panel(layers, "", LANE * len(lanes), limits=(0.5, len(lanes) + 0.5), rows=names)
+    axis = "time since the start of the recording, s"
+    return chart(figure, f"Rests of each recording. {counts}.", [panel], axis, left=LEFT)
 
 
 def _spans(recording: Recording, logged: list[Rest], calibration: JSON) -> list[tuple[float, float, int]]:
