@@ -337,13 +337,10 @@ def _check_spans(recording: Recording) -> None:
             which = "the rows in which the table turns"
             stuck += [(TRIADS["accelerometer"][i], spans[i], "1 g", which) for i in across if spans[i] < SPANNED]
     for channel, span, expected, which in stuck:
-        raise refusal(
-            recording,
-            "stuck",
-            f"{channel} stays within {span:.3g} {expected.partition(' ')[2]} in nine tenths of {which}, while the "
-            f"table's motion about {recording.axis} makes it vary by {expected}",
-            "is the column right, and does this axis of the sensor work?",
-        )
+        least = f"{span:.3g} {expected.partition(' ')[2]} in nine tenths of {which}"
+        cause = f"while the table's motion about {recording.axis} makes it vary by {expected}"
+        hint = "is the column right, and does this axis of the sensor work?"
+        raise refusal(recording, "stuck", f"{channel} stays within {least}, {cause}", hint)
 
 
 def _span(values: Values) -> Values:

@@ -443,13 +443,10 @@ def _check_directions(
     allowed = (limits.gain + limits.rate) * size + limits.late_s * change + limits.offset_dps
     usual_off, usual_size = float(median(off)), float(median(size))
     if usual_off > float(median(allowed)) + 0.5 * usual_size:
-        raise refusal(
-            recording,
-            "reference_contradiction",
-            f"{limits.column(recording, 'table_attitude')} turns about other body axes than the gyroscope reads: their "
-            f"angular rates differ by {usual_off:.3g} deg/s at the median, at {usual_size:.3g} deg/s",
-            "is it the attitude of this recording, from body to level, in the order w, x, y, z?",
-        )
+        way = f"{limits.column(recording, 'table_attitude')} turns about other body axes than the gyroscope reads"
+        message = f"{way}: their angular rates differ by {usual_off:.3g} deg/s at the median, at {usual_size:.3g} deg/s"
+        hint = "is it the attitude of this recording, from body to level, in the order w, x, y, z?"
+        raise refusal(recording, "reference_contradiction", message, hint)
 
 
 def _delay_of(recording: Recording, channels: Sequence[Channel], limits: ChannelLimits) -> Delay | None:
@@ -471,14 +468,11 @@ def _delay_of(recording: Recording, channels: Sequence[Channel], limits: Channel
         best, low, high = ((d - furthest) * step for d in interval)
         delay = Delay(best, low, high)
         if abs(delay.nearest(0.0)) > max(allowed, MIN_SHARE_OF_USUAL_GAIN * step) + QUARTER * step:
-            raise refusal(
-                recording,
-                "reference_contradiction",
-                f"{limits.column(recording, first.name)} runs {abs(best):.3g} s {'late' if best < 0 else 'early'} "
-                f"against {limits.column(recording, other.name)}; the limits of time_offset, low_pass_lag"
-                f"{' and clock_rate' if of_sensor else ''} allow {allowed:.3g} s",
-                ALIGN,
-            )
+            a, b = (limits.column(recording, channel.name) for channel in (first, other))
+            late = f"{a} runs {abs(best):.3g} s {'late' if best < 0 else 'early'} against {b}"
+            limiting = f"the limits of time_offset, low_pass_lag{' and clock_rate' if of_sensor else ''}"
+            message = f"{late}; {limiting} allow {allowed:.3g} s"
+            raise refusal(recording, "reference_contradiction", message, ALIGN)
         found = delay if of_sensor else found
     return found
 

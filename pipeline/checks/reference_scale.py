@@ -178,13 +178,9 @@ def check_scale_of_motion(recording: Recording, size: Values | None, limits: Cha
         raise _wrong_rate(recording, limits, ratio, "the table's attitude", gyro_agrees=False)
     if ratio.of_time:
         raise _wrong_time(recording, limits, ratio, "the table's rate sums up to")
-    raise refusal(
-        recording,
-        "reference_scale",
-        f"{limits.column(recording, 'table_attitude')} turns {1.0 / ratio.value:.4g} times as fast as "
-        f"{limits.column(recording, 'table_rate')} and the gyroscope say",
-        "is it the attitude of this recording, and is the time in s?",
-    )
+    turns = f"{limits.column(recording, 'table_attitude')} turns {1.0 / ratio.value:.4g} times as fast as"
+    message = f"{turns} {limits.column(recording, 'table_rate')} and the gyroscope say"
+    raise refusal(recording, "reference_scale", message, "is it the attitude of this recording, and is the time in s?")
 
 
 def doubt_of_angle(recording: Recording, limits: ChannelLimits) -> str | None:

@@ -192,18 +192,11 @@ class Ranking:
             values, uncertainty, at = term.values.copy(), np.zeros(len(term.values)), slice(0, len(linear[i]))
             values[at] = linear[i] + (term.values[at] if this.moves else 0.0)
             uncertainty[at] = uncertainties[i]
-            score = Score(
-                this.name,
-                delta_bic=gain - k * float(np.log(self.samples)),
-                p_value=float(scipy.special.chdtrc(k, gain)),
-                parameters=k,
-                values=values,
-                uncertainty=uncertainty,
-                setting=best,
-                admissible=bool(weakest[i] > MIN_NEW_VARIANCE),
-                plausible=within(values, uncertainty, limits.get(this.name, np.inf)),
-                drop=float(2.0 * signal @ cross[i, 0] - signal @ inner[i, 0] @ signal),
-            )
+            plausible = within(values, uncertainty, limits.get(this.name, np.inf))
+            p, admissible = float(scipy.special.chdtrc(k, gain)), bool(weakest[i] > MIN_NEW_VARIANCE)
+            delta_bic = gain - k * float(np.log(self.samples))
+            drop = float(2.0 * signal @ cross[i, 0] - signal @ inner[i, 0] @ signal)
+            score = Score(this.name, delta_bic, p, k, values, uncertainty, best, admissible, plausible, drop)
             yield j, score, likelihood[i]
 
     def shares(self, j: int, selected: Sequence[int], setting: int) -> dict[str, float]:

@@ -422,14 +422,9 @@ def align(sensor: Log, log: Log) -> Log:
     if inside.size < 2:
         raise IngestError("no time is covered by both logs", log.path, code="no_sync")
     rows = slice(int(inside[0]), int(inside[-1]) + 1)
-    clock = {
-        "offset_s": float(log.time_ns[0] - sensor.time_ns[0]) / 1e9 + fit.offset,
-        "offset_uncertainty_s": fit.offset_uncertainty,
-        "drift_ppm": fit.drift * 1e6,
-        "drift_uncertainty_ppm": fit.drift_uncertainty * 1e6,
-        "at_s": fit.middle,
-        "correlation": fit.correlation,
-    }
+    offset = float(log.time_ns[0] - sensor.time_ns[0]) / 1e9 + fit.offset
+    clock = {"offset_s": offset, "offset_uncertainty_s": fit.offset_uncertainty, "drift_ppm": fit.drift * 1e6}
+    clock |= {"drift_uncertainty_ppm": fit.drift_uncertainty * 1e6, "at_s": fit.middle, "correlation": fit.correlation}
     return _merged(sensor, log, rows, tau[rows], clock, _notes(sensor, rows, fit, clock["offset_s"]))
 
 

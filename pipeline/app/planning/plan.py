@@ -416,13 +416,10 @@ def _gain(change: ProcedureChange, before: Document, after: Document) -> PlanGai
     of_table = {entry["effect"] for entry in old.values() if effect(entry["effect"]).owner == Owner.TABLE}
     both = [key for key in new if key in old]
     ratios = [np.log(new[key]["smallest"] / old[key]["smallest"]) for key in both]
-    return PlanGain(
-        change,
-        after["minutes"] - before["minutes"],
-        tuple(key for key, entry in new.items() if key not in old and entry["effect"] not in of_table),
-        tuple(key for key in both if old[key]["taken_for"] and not new[key]["taken_for"]),
-        float(np.exp(np.mean(ratios))) if ratios else 1.0,
-    )
+    shown = tuple(key for key, entry in new.items() if key not in old and entry["effect"] not in of_table)
+    apart = tuple(key for key in both if old[key]["taken_for"] and not new[key]["taken_for"])
+    factor = float(np.exp(np.mean(ratios))) if ratios else 1.0
+    return PlanGain(change, after["minutes"] - before["minutes"], shown, apart, factor)
 
 
 def helps_most(gains: Sequence[PlanGain]) -> list[str]:

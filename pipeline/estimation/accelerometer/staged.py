@@ -497,14 +497,10 @@ def fit(task: StageInput) -> SensorCalibration:
     fits = [linear_convergence(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in of_turns]
     cosine, condition = max(each.cosine for each in fits), max(each.condition for each in fits)
     last = name == "scale_factor"
-    calibration = SensorCalibration(
-        sensor="accelerometer",
-        bias=found.bias,
-        matrix=np.diag(1.0 / found.k),
-        stages=(*task.stages, result),
-        effects=(fitted_effect(ASYMMETRY, "accelerometer", found.c),) if last else (),
-        convergence=Convergence(cosine, condition, len(theta), len(theta)),
-    )
+    effects = (fitted_effect(ASYMMETRY, "accelerometer", found.c),) if last else ()
+    convergence, stages = Convergence(cosine, condition, len(theta), len(theta)), (*task.stages, result)
+    calibration = SensorCalibration("accelerometer", found.bias, np.diag(1.0 / found.k), stages, effects)
+    calibration = replace(calibration, convergence=convergence)
     kept = slice(0, after_c) if last else BASE
     if estimator.as_printed:
         return combined(calibration, [scatter.of(kept)], {"everything but noise": AS_PRINTED})

@@ -91,16 +91,9 @@ def with_stage(before: SensorCalibration, stage: StageResult, model: Model, fitt
     at_rest = slice(0, model.rests_equations)
     rms = float(np.sqrt(np.mean((fitted.residual[at_rest] * fitted.error[at_rest]) ** 2)))
     rank = fitted.rank - len(model.known_by_limit)
-    return replace(
-        before,
-        bias=fitted.state.bias,
-        matrix=fitted.state.matrix,
-        stages=(*before.stages, replace(stage, residual_rms=rms)),
-        converged=fitted.converged,
-        convergence=Convergence(
-            fitted.cosine, fitted.condition, rank, len(fitted.covariance), fitted.cosine_at_minimum
-        ),
-    )
+    convergence = Convergence(fitted.cosine, fitted.condition, rank, len(fitted.covariance), fitted.cosine_at_minimum)
+    found = replace(before, bias=fitted.state.bias, matrix=fitted.state.matrix, converged=fitted.converged)
+    return replace(found, stages=(*before.stages, replace(stage, residual_rms=rms)), convergence=convergence)
 
 
 def after_stage(

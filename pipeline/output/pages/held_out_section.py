@@ -85,17 +85,11 @@ def over_temperature(calibration: SensorCalibration, recordings: list[Recording]
             layers += [Dots(warmth[way], values[i][way], c) for way, c in ((warming >= 0, 0), (warming < 0, 2))]
             panels.append(Panel(layers, f"{axis}, {unit}", height, {} if values is reading else {"": 0.0}))
     rms = [number(float(np.sqrt(np.nanmean(values**2))), 2) for values in (reading, reading - model)]
-    return chart(
-        Figure(
-            f"{sensor}-temperature",
-            f"Over the temperature the reading changes by {rms[0]} {unit}, beyond the model by {rms[1]} {unit} (rms)",
-            "Soaks: change of the mean reading, and below it reading minus model.",
-            (("c0", "warming"), ("c2", "cooling"), ("c5", "model")),
-        ),
-        f"Between {number(np.nanmin(warmth), 3)} and {number(np.nanmax(warmth), 3)} °C.",
-        panels,
-        "temperature, °C",
-    )
+    finding = f"Over the temperature the reading changes by {rms[0]} {unit}, beyond the model by {rms[1]} {unit} (rms)"
+    caption = "Soaks: change of the mean reading, and below it reading minus model."
+    figure = Figure(f"{sensor}-temperature", finding, caption, (("c0", "warming"), ("c2", "cooling"), ("c5", "model")))
+    span = f"Between {number(np.nanmin(warmth), 3)} and {number(np.nanmax(warmth), 3)} °C."
+    return chart(figure, span, panels, "temperature, °C")
 
 
 def checks(validation: JSON | None) -> list[JSON]:

@@ -116,16 +116,10 @@ def cut(recording: Recording, windows: Sequence[Window] | None = None, *, found:
         since = first - recording.time[0], last - recording.time[0]
         detail = f"{what}, from {since[0]:.2f} to {since[1]:.2f} s of {recording.name}: {how}"
         part = recording.select(slice(start, stop))
-        out.append(
-            replace(
-                part,
-                name=name if count[name] == 1 else f"{name}_{count[name]}",
-                role=role,
-                axis=axis,
-                table_rate=part.table_rate if axis is not None else _size_of_rate(part),
-                notes=(*(() if out else recording.notes), Note("N-SEGMENT", stop - start, 0, 0, detail, first, last)),
-            )
-        )
+        rate = part.table_rate if axis is not None else _size_of_rate(part)
+        notes = (*(() if out else recording.notes), Note("N-SEGMENT", stop - start, 0, 0, detail, first, last))
+        unique = name if count[name] == 1 else f"{name}_{count[name]}"
+        out.append(replace(part, name=unique, role=role, axis=axis, table_rate=rate, notes=notes))
     return out
 
 
