@@ -76,6 +76,7 @@ MIN_EIGENVALUE_SHARE = 1e-12  # of the eigenvalues of a scaled matrix: the round
 AVERAGED_OUT = 1e-3  # share of a column's size in block means, below which it does not absorb their noise
 RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
 PART_OF_NULL_SPACE = 1e-3  # component of a unit vector of it, above which a parameter is named as not determined
+PART_OF_SMALL = 0.2  # the same for the vectors of small eigenvalues, which noise turns
 ROW_SUM_RIDGE = 1e-9  # 1e7 times the rounding of a double, for sums over many rows; 3e-5 of a standard deviation
 Draw = Callable[[np.random.Generator, int], Values]
 SEED = 101  # any number
@@ -418,11 +419,11 @@ class ScaledColumns:
     tolerance: float  # share of the largest singular value, below which a combination is not determined
 
     @classmethod
-    def of(cls, A: Values, tolerance: float = RANK_TOLERANCE) -> ScaledColumns:
-        """Factorise (n, p) columns; n may be smaller than p."""
+    def of(cls, A: Values, tolerance: float = RANK_TOLERANCE, scale: Values | None = None) -> ScaledColumns:
+        """Factorise (n, p) columns, in units of their norms unless ``scale`` states others; n may be smaller than p."""
         n, p = A.shape
-        scale = np.linalg.norm(A, axis=0)
-        scale[scale == 0] = 1.0
+        scale = np.linalg.norm(A, axis=0) if scale is None else scale
+        scale = np.where(scale == 0, 1.0, scale)
         Q, R = np.linalg.qr(A / scale)
         U, s, Vt = np.linalg.svd(R, full_matrices=n < p)
         singular, basis = np.zeros(p), np.zeros((n, p))
@@ -463,6 +464,12 @@ class ScaledColumns:
                 f"combination with each other: {', '.join(self.undetermined(names))}. Record motion that changes these "
                 "independently, or fix some of them"
             )
+
+
+def undetermined_columns(products: Values, least: float) -> Values:
+    """Return which columns of (p, p) products of unit columns take part in combinations of a smaller eigenvalue."""
+    values, vectors = np.linalg.eigh(products)
+    return np.asarray(np.linalg.norm(vectors[:, values < least], axis=1) > PART_OF_SMALL)
 
 
 def cholesky(matrix: Values) -> Values:

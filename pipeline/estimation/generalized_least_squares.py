@@ -59,6 +59,7 @@ from pipeline.estimation.engine import (
     ErrorMixture,
     ResidualNoise,
     noise_outside_known_errors,
+    undetermined_columns,
     with_matrix,
 )
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, selection_grid
@@ -305,11 +306,8 @@ def require_observable(observations: Observations, fit: JointFit) -> None:
     names = [name for name, kept in zip(names, free, strict=True) if kept]
     size = design.sizes()[:-1][free]
     products = design.products([WHITE_SETTING])[0][0, :-1, :-1][np.ix_(free, free)]
-    values, vectors = np.linalg.eigh(products / np.outer(*[np.where(size > 0, size, 1.0)] * 2))
-    undetermined = vectors[:, values < LEAST_EIGENVALUE].T
-    weak = [name for name, s in zip(names, size, strict=True) if s == 0]
-    weak += [name for vector in undetermined for name, share in zip(names, np.abs(vector), strict=True) if share > 0.2]
-    weak = list(dict.fromkeys(weak))
+    lost = undetermined_columns(products / np.outer(*[np.where(size > 0, size, 1.0)] * 2), LEAST_EIGENVALUE)
+    weak = [name for name, each in zip(names, lost, strict=True) if each]
     if weak:
         involved = [t.effect for t in fit.terms if any(name.startswith(f"{t.effect.name}.") for name in weak)]
         advice = "; ".join(f"{effect.name} needs {effect.excitation}" for effect in involved)

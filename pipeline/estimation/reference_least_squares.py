@@ -32,6 +32,7 @@ import numpy as np
 from pipeline.core.errors import ConfigurationError, NotObservableError
 from pipeline.core.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageResult, Values
 from pipeline.estimation.candidates import bench_effects
+from pipeline.estimation.design import MIN_DESIGN_SINGULAR_VALUE, PART_OF_IT
 from pipeline.estimation.engine import LinearMap, ScaledColumns, linear_convergence, with_matrix
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.stages import FitStage, StageInput, details_on_table
@@ -45,7 +46,6 @@ from pipeline.physics.signal.filters import filtered
 NAME = "reference_least_squares"
 FIT_STAGES = {NAME: FitStage(accepts=("readings",), changes=("bias", "matrix", "effects"), free=True, reference=True)}
 PARAMETER_COLUMNS = ("bias", *(f"matrix column {axis}" for axis in AXES))
-MIN_REFERENCE_SINGULAR_VALUE = 1e-3  # smallest singular value of unit columns that still counts as determined
 SHARP_CHANGE = 1e-3  # of the largest rate between two samples, where the rate is not logged
 ADVICE = {
     "accelerometer": "turns about at least two axes bring gravity along all three",
@@ -133,16 +133,11 @@ def _require_observable(sensor: str, X: Values, root: Values) -> float:
     ``root``: (n, 1), of the samples of each row.
     """
     size = float(np.max(np.linalg.norm(X[:, 1:], axis=1)))
-    scaled = root * X / np.array([1.0, size, size, size]) / np.linalg.norm(root)
-    _, s, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
-    singular = np.zeros(4)
-    singular[: len(s)] = s
-    null = Vt[singular < MIN_REFERENCE_SINGULAR_VALUE * singular[0]]
-    if len(null):
-        share = np.linalg.norm(null, axis=0)
-        lost = [name for name, part in zip(PARAMETER_COLUMNS, share, strict=True) if part > 0.1]
+    units = np.linalg.norm(root) * np.array([1.0, size, size, size])
+    columns = ScaledColumns.of(root * X, MIN_DESIGN_SINGULAR_VALUE, units)
+    if lost := columns.undetermined(PARAMETER_COLUMNS, PART_OF_IT):
         raise NotObservableError(
             f"{sensor}: the recordings do not determine {', '.join(lost)}"
             f"{' independently of each other' if len(lost) > 1 else ''}: {ADVICE[sensor]}"
         )
-    return float(singular[0] / singular[-1])
+    return columns.condition

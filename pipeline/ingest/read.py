@@ -5,11 +5,10 @@ Times of a unit count from power-on. If the times of two files overlap, they are
 since 1970 are converted to times since the first sample, because a double resolves 1.7*10^9 s to 2*10^-7 s only, too
 coarse to differentiate.
 
-Read a file of attitudes: one row an attitude, or a block of rows with equal ``label``; times do not count.
-
-The rows get times of their own, so that blocks are ``BETWEEN_ATTITUDES_S`` apart. A row that is an attitude by itself
-is a mean over an unknown time. Its white noise is that of the sensor file over ``AVERAGED_S``; the scatter of the
-attitudes about the fit adds to it.
+A file of attitudes has one row an attitude, or a block of rows with equal ``label``; times do not count. The rows
+get times of their own, so that blocks are ``BETWEEN_ATTITUDES_S`` apart. A row that is an attitude by itself is a mean
+over an unknown time. Its white noise is that of the sensor file over ``AVERAGED_S``; the scatter of the attitudes about
+the fit adds to it.
 """
 
 from __future__ import annotations

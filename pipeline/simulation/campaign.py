@@ -1,4 +1,4 @@
-"""Simulate a session: all recordings of one unit's procedure, on one clock since power-on, with the table's log.
+"""Simulate a campaign: the session of each unit on one clock since power-on, with the table's log, in files.
 
 Every stream of random numbers has a separate generator, ``default_rng([seed, unit, stream])``, so that a change in one
 (say, lost samples) does not change the others.
@@ -14,8 +14,6 @@ d, k   : offset and drift of the table's clock, s and 1
 
 A file has the sampling interval of the table's computer. For a table without encoders the program is written as a
 separate procedure.
-
-Write a simulated campaign: units.csv, campaign.yaml, the recordings, and the true parameters.
 
     <directory>/units.csv, campaign.yaml, simulation.yaml
     <directory>/raw/<unit>/<recording>.csv (or .mcap)

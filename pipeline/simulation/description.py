@@ -1,4 +1,4 @@
-"""Read the description of a simulation, ``simulation.yaml``.
+"""Read the description of a simulation, ``simulation.yaml``, and plan the recordings of its procedures.
 
     seed: 2019                       # every number follows from it
     defaults: {...}                  # keys of a unit, for all units
@@ -15,7 +15,7 @@
 Parameters that are not stated are drawn at random from the sensor file. The keys of a unit are the attributes of
 ``UnitDescription``.
 
-Plan the recordings of a procedure: the program of the table, or the attitudes and moves by hand, for each.
+A recording has the program of the table, or the attitudes and moves by hand. The procedures:
 
 ``three_axis_turns`` and ``thermal_ramp`` (Sudsanguan 2019, chapter 4): about each axis, stop-and-go or continuous turns
 for the accelerometer, turns at one or several rates between rests for the gyroscope; then held-out random motion and a

@@ -1,11 +1,9 @@
-r"""Read the options of Hydra groups, parse overrides, and resolve references.
+r"""Read the options of Hydra groups and the overrides of a user, and resolve what they name: settings, effects, files.
 
 A reference ``${group.key}`` in a value stands for the value of that setting, and ``\${`` for the characters ``${``.
 OmegaConf does not resolve them: its resolvers, such as ``${oc.env:NAME}``, would write environment variables of the
 user into the pages of a campaign, and it takes 64 ms to build a configuration. A reference names a value or a list of
 values that is not a reference itself, so the time is proportional to the size of a file.
-
-Load the effects that a user defines, and the calibrations of ``method=given``.
 
 Effects by formula are files of the campaign; only the command line can name Python files. The calibration that
 ``method=given`` reads from a file becomes a setting: if it changes, exactly the stages that read it are repeated.

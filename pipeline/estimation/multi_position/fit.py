@@ -49,14 +49,13 @@ import scipy
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import Values
 from pipeline.estimation.candidates import estimates, parameter_names
-from pipeline.estimation.engine import ErrorMixture
+from pipeline.estimation.engine import ErrorMixture, undetermined_columns
 from pipeline.estimation.gates import within
 from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis, State, stepped
 
 Limits: TypeAlias = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
 Hypotheses: TypeAlias = Sequence[NoiseHypothesis]
 
-# share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 MAX_STEP_HALVINGS = 30  # of a step; a smaller one is rounding
 MIN_NEW_NORM_SHARE = 1e-3  # of a column beside the others, below which rounding decides: as ``MIN_NEW_COLUMN_SHARE``
 REDUNDANT_RESTS = 10  # that are recommended beyond the parameters, so that residuals show the noise
@@ -558,9 +557,8 @@ def require_observable(model: Model, fitted: FitByHand, limits: Limits) -> None:
     shown = zip(fitted.state.terms, equations.effects, strict=True)
     lost = [term.effect for term, Z in shown if adds_nothing(Q, Z)]
     scaled = equations.columns / np.maximum(np.linalg.norm(equations.columns, axis=0), 1e-300)
-    weak = np.linalg.eigh(scaled.T @ scaled + np.diag(limited.astype(float)))
-    undetermined = np.abs(weak.eigenvectors[:, weak.eigenvalues < UNDETERMINED_COLUMN_SHARE])[-len(names) :]
-    loose = [name for name, row in zip(names, undetermined, strict=True) if np.any(row > 0.2)]
+    weak = undetermined_columns(scaled.T @ scaled + np.diag(limited.astype(float)), UNDETERMINED_COLUMN_SHARE)
+    loose = [name for name, each in zip(names, weak[-len(names) :], strict=True) if each]
     if lost or loose:
         advice = "; ".join(f"{e.name} needs {e.excitation}" for e in lost or [t.effect for t in fitted.state.terms])
         raise NotObservableError(
