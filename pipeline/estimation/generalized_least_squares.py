@@ -122,11 +122,17 @@ class JointFit(Start):
         return self._designs[observations]
 
 
-def fit_terms(observations: Observations, terms: Terms, start: Start, settings: Sequence[Setting]) -> JointFit:
+def fit_terms(
+    observations: Observations,
+    terms: Terms,
+    start: Start,
+    settings: Sequence[Setting],
+    small: float = SMALL_STEP_UNCERTAINTIES,
+) -> JointFit:
     """Fit base and effects from a start.
 
     ``terms``: effects, at the start of their nonlinear parameters. ``settings``: noise settings over which the
-    likelihood is maximised.
+    likelihood is maximised. ``small``: the last step, standard uncertainties.
     """
     linear = not any(term.effect.nonlinear or term.effect.layout == Layout.SHARED for term in terms)
     rounds, converged, state = 0, False, _with_all_columns(start, terms)
@@ -138,9 +144,9 @@ def fit_terms(observations: Observations, terms: Terms, start: Start, settings: 
         taken = np.concatenate([solved.step[BASE], taken])
         K = state.K + matrix_of(taken)
         state = replace(state, bias=state.bias + taken[BIAS], K=K, terms=tuple(moved))
-        small = SMALL_STEP_UNCERTAINTIES * np.sqrt(np.diag(solved.best_covariance))
-        small[BASE] = np.maximum(small[BASE], 1e-12)
-        converged = linear or bool(np.all(np.abs(taken) <= small))
+        largest = small * np.sqrt(np.diag(solved.best_covariance))
+        largest[BASE] = np.maximum(largest[BASE], 1e-12)
+        converged = linear or bool(np.all(np.abs(taken) <= largest))
         if not converged:
             design = design_at(observations, state)
             solved = _solve(design, observations, settings)

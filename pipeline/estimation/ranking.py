@@ -44,6 +44,7 @@ class Score:
     admissible: bool = True  # whether the selected effects do not already explain its signal
     plausible: bool = True  # whether the estimates are within the sensor's limits
     drop: float = 0.0  # decrease of the unwhitened sum of squares by the estimates
+    rough: bool = False  # whether it is by a fit that is only near the candidate's optimum
 
     def refined(self, gain: float, samples: float, terms: Terms, covariance: Values, limit: Values | float) -> Score:
         """Return the score by a fit at the candidate's optimum; ``covariance``: see ``estimates``."""

@@ -27,7 +27,13 @@ from pipeline.estimation.design import EffectColumns, Start, Terms, ordinary_bas
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gates import MAX_FALSE_PROBABILITY, MIN_DELTA_BIC, passes
 from pipeline.estimation.gauss_markov import Setting, selection_grid
-from pipeline.estimation.generalized_least_squares import JointFit, fit_best, fit_terms, require_observable
+from pipeline.estimation.generalized_least_squares import (
+    SMALL_STEP_UNCERTAINTIES,
+    JointFit,
+    fit_best,
+    fit_terms,
+    require_observable,
+)
 from pipeline.estimation.observations import Observations, weighted
 from pipeline.estimation.ranking import Ranking, Score
 from pipeline.physics.effects import effect
@@ -40,6 +46,9 @@ MOVER_SHARE = 0.1  # of the best candidate's delta BIC above which an effect of 
 CONSTANT_SHARE = 0.6  # the same for an effect with a time constant, whose start is near its optimum
 DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is selected unless the second is clearly better
 STRONG_DELTA_BIC = 6.0  # delta BIC: "strong" evidence (Raftery 1995)
+# last step of a rough fit; from there 2 log L of an unexplained sensor's fits changed by less than 4
+ROUGH_STEP_UNCERTAINTIES = 3.0
+ROUGH_DELTA_BIC = 30.0  # below that of the best candidate, from which on a rough score is enough
 TIE = 0.5  # delta BIC below which the catalogue's order decides
 FAR_ABOVE = 2.0  # times the noise: the residual of a model that lacks more than one effect of the catalogue
 WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
@@ -88,7 +97,7 @@ def select(
     def selected() -> Selection:
         selection = searched(observations, {})
         remaining = without_unknown_motion(observations, selection.fit.terms)
-        return selection if remaining is observations else searched(remaining, selection.fits)
+        return selection if remaining is observations else searched(remaining, {**selection.rough, **selection.fits})
 
     starts, candidates = models(observations)
     terms = [tuple(term.key for term in terms) for terms in ([*candidates.values()], *starts)]
@@ -114,6 +123,7 @@ class Selection:
     alone: dict[str, Score] = field(default_factory=dict)  # of each candidate against the base
     fits: dict[tuple[str, ...], JointFit] = field(default_factory=dict)  # of base, configured and further effects
     optima: dict[Hashable, JointFit] = field(default_factory=dict)  # of candidates, by all terms at the start
+    rough: dict[tuple[str, ...], JointFit] = field(default_factory=dict)  # as ``fits``, only near their optimum
     near: Mapping[tuple[str, ...], JointFit] = field(default_factory=dict)  # fits from which those of ``fits`` start
     refused: set[frozenset[str]] = field(default_factory=set)  # sets with a time constant that is not determined
 
@@ -174,7 +184,7 @@ class Selection:
         for _ in range(3 * MAX_SELECTED_EFFECTS):
             if len(self.names) == MAX_SELECTED_EFFECTS:
                 return
-            best = self._best(self._scores() if self.names else list(self.alone.values()))
+            best = self._next()
             if best is None:
                 if not self._exchange():
                     return
@@ -207,32 +217,48 @@ class Selection:
         return {s.name: s for s in self.ranking.scores(self.ranking.of_effects(names), self.limits)}
 
     def _scores(self) -> list[Score]:
-        """Score all candidates; fit competing ones of timing or with a time constant to their optimum."""
+        """Score all candidates; competing ones of timing or with a time constant are fitted near their optimum.
+
+        Before any effect is selected, they are fitted to it: each is then reported.
+        """
         scores = list(self._given(self.names).values())
         top = max((s.delta_bic for s in scores if s.admissible), default=0.0)
         for i, score in enumerate(scores):
             this = effect(score.name)
             share = MOVER_SHARE if this.moves else CONSTANT_SHARE
-            able = not self.names or self._able(score.name)  # alone, every candidate is reported at its optimum
+            able = not self.names or self._able(score.name)
             if able and this.nonlinear and score.delta_bic > max(MIN_DELTA_BIC, share * top):
-                scores[i] = self._refined(score)
+                scores[i] = self._refined(score, rough=bool(self.names))
         return scores
 
-    def _refined(self, score: Score) -> Score:
-        """Return the score of a nonlinear candidate at its own optimum."""
+    def _next(self) -> Score | None:
+        """Return the candidate to accept; those that are nearly as good have been fitted to their optimum."""
+        scores = self._scores() if self.names else list(self.alone.values())
+        while True:
+            best = self._best(scores)
+            least = np.inf if best is None else best.delta_bic - ROUGH_DELTA_BIC
+            if not any(s.rough and s.delta_bic > least for s in scores):
+                return best
+            scores = [self._refined(s) if s.rough and s.delta_bic > least else s for s in scores]
+
+    def _refined(self, score: Score, *, rough: bool = False) -> Score:
+        """Return the score of a nonlinear candidate at its own optimum, or near it (``rough``)."""
         this = effect(score.name)
-        values = score.values
+        values, names = score.values, (*self.names, score.name)
         if this.name == DELAYS[1]:
             values = np.maximum(values, this.starts(self.observations.sensor)[0])
         terms = [*self.base.terms, *self._terms(), EffectColumns(this, values)]
-        key = tuple(term.key for term in terms)
+        key = rough, *(term.key for term in terms)
         if key not in self.optima:
-            fit = self._fitted((*self.names, score.name), terms, self.start)
+            small = ROUGH_STEP_UNCERTAINTIES if rough else SMALL_STEP_UNCERTAINTIES
+            fit = self._fitted(names, terms, self.start, small)
             self.optima[key] = replace(fit)  # without its design: there are many candidates
-        self.fits[*self.names, score.name] = fit = self.optima[key]
+        fit = self.optima[key]
+        (self.rough if rough else self.fits)[names] = fit
         before, _ = self.ranking.of_model(self.ranking.of_effects(self.names))
         gain, limit = 2.0 * (fit.log_likelihood - before), self.limits.get(score.name, np.inf)
-        return score.refined(gain, self.ranking.samples, fit.terms, fit.covariance, limit)
+        refined = score.refined(gain, self.ranking.samples, fit.terms, fit.covariance, limit)
+        return replace(refined, rough=rough)
 
     def _best(self, scores: Sequence[Score]) -> Score | None:
         """Return the candidate to accept; a plausible one is preferred if two differ by less than the threshold."""
@@ -294,13 +320,15 @@ class Selection:
             self.fits[key] = self._fitted(key, terms, self.fit)
         self.fit = self.fits[key]
 
-    def _fitted(self, names: tuple[str, ...], terms: Terms, start: Start) -> JointFit:
+    def _fitted(
+        self, names: tuple[str, ...], terms: Terms, start: Start, small: float = SMALL_STEP_UNCERTAINTIES
+    ) -> JointFit:
         """Fit terms from a start, or from the fit of the same effects that is known to be near."""
-        if (near := self.near.get(names)) is not None:
+        if (near := self.rough.get(names) or self.near.get(names)) is not None:
             values = {term.effect.name: term.values for term in near.terms}
             terms = [replace(term, values=values[term.effect.name]) for term in terms]
             start = Start(near.bias, near.K, start.scale)
-        return fit_terms(self.observations, terms, start, self.settings)
+        return fit_terms(self.observations, terms, start, self.settings, small)
 
     def _terms(self) -> list[EffectColumns]:
         """Return the selected effects at their fitted values, or at those of the step that accepted them."""

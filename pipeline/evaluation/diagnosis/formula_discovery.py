@@ -55,6 +55,7 @@ MAX_FORMULA_TERMS = 3  # as many as effects that a verdict believes at once (``B
 REFINED = 16  # forms that are scored under every noise setting, and whose constants are scanned more finely
 SCAN_REFINEMENTS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
 ROWS_AT_ONCE = 1024  # whose products of columns are computed together: 16 MB for 100 columns of a model
+SAME_CRITERION = 1e-6  # a thousand times the rounding of fits of one model
 PROBED = 200  # rows; two forms whose values there are equal to 1e-9 are one
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
 OBSERVABLE_BY = {"temperature": "bias_temperature"}  # effect that is observable if the recordings vary the covariate
@@ -407,7 +408,8 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
             forget(form.name)
         criterion = _criterion(reselected, terms)
         if criterion > least:
-            least, best = criterion, Discovery(context, reselected, [entry, *unknown], definition)
+            # one form may be found in both contexts, as ``u ** 2`` and ``(u / 200) ** 2``: then the first
+            least, best = criterion + SAME_CRITERION, Discovery(context, reselected, [entry, *unknown], definition)
             suggested = found, terms, ranked
     if best.suggested is None:
         return best

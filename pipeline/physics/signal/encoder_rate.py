@@ -427,15 +427,19 @@ class EncoderTrajectory:
         def of_rows(*means: Values) -> tuple[Values, ...]:
             return tuple(np.add.reduceat(pieces.share * values, pieces.of_row) for values in means)
 
+        unfiltered = cache(lambda: self.at(points))
+
         def line() -> tuple[Values, ...]:
-            angle, rate, acceleration = self.at(points)
+            angle, rate, acceleration = unfiltered()
             if lag <= 0.0:
                 return of_rows(mean(angle), slope(angle, rate), slope(rate, acceleration))
             rate, acceleration = self.lagged(points, lag)
             return of_rows(mean(angle), slope(angle - lag * rate, rate), slope(rate, acceleration))
 
         def circle() -> tuple[Values, ...]:
-            return of_rows(*map(mean, self._circle(points, lag)))
+            turn = np.radians(unfiltered()[0]) if lag <= 0.0 else None
+            both = self._circle(points, lag) if turn is None else (np.cos(turn), np.sin(turn))
+            return of_rows(*map(mean, both))
 
         return cache(line), cache(circle)
 
@@ -484,7 +488,7 @@ class EncoderTrajectory:
         v, g = np.zeros((2, -(-len(self.time) // LAG_GROUP) * LAG_GROUP))
         v[0] = self.rate[0]
         inside = slice(1, len(self.time))
-        v[inside], g[inside] = self._lag_step(np.arange(len(self._step)), self._step, lag)
+        v[inside], g[inside] = self._lag_step(slice(len(self._step)), self._step, lag)
         v, g = (np.ascontiguousarray(each.reshape(-1, LAG_GROUP).T) for each in (v, g))
         for before, j in pairwise(range(LAG_GROUP)):  # g: from now on the weight of the output before the group
             v[j] += g[j] * v[before]
@@ -498,16 +502,17 @@ class EncoderTrajectory:
         v[:, 1:] += g[:, 1:] * ends[:-1]
         return v.T.ravel()[: len(self.time)]
 
-    def _lag_step(self, k: Index, x: Values, lag: float) -> tuple[Values, Values]:
+    def _lag_step(self, k: Index | slice, x: Values, lag: float) -> tuple[Values, Values]:
         """Return the output of a lag at x into intervals: a value, and a factor on the output at x = 0."""
-        rate, a, s = self.rate[k], self._before[k], self._bend[k]
+        a, s = self._before[k], self._bend[k]
         first, bent = np.minimum(x, s), np.flatnonzero(x > s)
-        fade = np.exp(-first / lag)
-        middle = rate + a * first
-        own = middle - a * lag + (a * lag - rate) * fade
-        b, second = self._after[k[bent]], (x - s)[bent]
-        fade_after = np.exp(-second / lag)
-        own[bent] = middle[bent] + b * (second - lag) + (own - middle)[bent] * fade_after + b * lag * fade_after
+        fade, slow = np.exp(first / -lag), lag * a
+        own = self.rate[:-1][k] - slow
+        middle = own + a * first
+        own = np.subtract(middle, own * fade, out=own)
+        b, second = self._after[k][bent], (x - s)[bent]
+        fade_after, end = np.exp(-second / lag), (middle + slow)[bent]
+        own[bent] = end + b * (second - lag) + (own[bent] - end) * fade_after + b * lag * fade_after
         fade[bent] *= fade_after
         return own, fade
 
