@@ -427,6 +427,5 @@ def _states(path: Path, name: str = "") -> dict[str, str]:
 
 
 def _digest(states: Mapping[str, str]) -> str:
-    """Return a digest of the names and states of files."""
     lines = ["\0".join((f"/{name}" if name else "", *state.split())) for name, state in states.items()]
     return hashlib.sha256("\n".join(sorted(lines)).encode(errors="surrogateescape")).hexdigest()[:32]

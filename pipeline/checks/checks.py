@@ -285,7 +285,6 @@ def _placed(recordings: list[Recording], table: Table) -> list[Recording]:
 
 
 def _check_shared_rows(recordings: Sequence[Recording]) -> None:
-    """Refuse two recordings with the same samples."""
     decimals = [_decimals(r) for r in recordings]
     for coarser in sorted({tuple(map(min, x, y)) for x, y in itertools.combinations(decimals, 2)}, reverse=True):
         _check_at(recordings, coarser)

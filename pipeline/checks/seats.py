@@ -89,8 +89,6 @@ class TurnRecording:
 
 @dataclass(frozen=True)
 class _Conventional:
-    """A turn by the convention of its mounting."""
-
     turn: TurnRecording
     bench: TurnMounting
     gravity: FittedGravity

@@ -186,7 +186,6 @@ class Batch:
 
     @cached_property
     def _exports(self) -> dict[str, list[str]]:
-        """Members of the pack of exports by unit."""
         found: dict[str, list[str]] = {}
         for name in self.packs["export"].names():
             found.setdefault(name.partition("/")[0], []).append(name)

@@ -283,7 +283,6 @@ def fit_chips(reference: Chip, other: Chip, sensors: Sequence[str]) -> RotationF
 
 
 def _joined(pairs: Sequence[BothChips]) -> BothChips:
-    """Return the rows of all recordings by each chip."""
     a, b = ({k: np.concatenate([pair[chip][k] for pair in pairs]) for k in pairs[0][chip]} for chip in (0, 1))
     return a, b
 

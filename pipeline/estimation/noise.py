@@ -315,8 +315,6 @@ class RestReadings:
 
 @dataclass(frozen=True)
 class _RestBlocks:
-    """Block means and scatter of rests."""
-
     # each (b,), s; first sample time and duration of each block
     start: Values
     length: Values

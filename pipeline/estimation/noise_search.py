@@ -124,7 +124,6 @@ class CompositionSearch:
             best = new
 
     def _best(self, columns: tuple[int, ...]) -> FittedComposition:
-        """Return the best composition so far with these columns."""
         return min((c for c in self.found.values() if c.columns == columns), key=lambda c: c.bic)
 
     def fit(self, starts: Sequence[tuple[Composition, Values]], columns: tuple[int, ...]) -> Work[None]:

@@ -455,7 +455,6 @@ def _products(
 
 
 def _problem(selection: Selection, fit: JointFit, candidates: Mapping[str, EffectColumns]) -> CandidateProblem:
-    """Return the linear problem at a fit."""
     observations = selection.observations
     configured = fit.terms[: len(selection.base.terms)]
     fitted = {t.effect.name: t.values for t in fit.terms[len(configured) :]}

@@ -106,7 +106,6 @@ def of_channels(values: Values) -> Values:
 
 
 def _select(sensor: str, part: TurnPart) -> TurnPart:
-    """Return a part with the samples that the fit uses."""
     if sensor == "accelerometer":
         return replace(part, keep=settled(part))
     if part.recording.table_rate is not None:

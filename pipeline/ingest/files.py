@@ -270,7 +270,6 @@ def _rows(text: str, path: str) -> Iterator[tuple[int, dict[str, str]]]:
 
 
 def _entry(row: Mapping[str, str], path: str, line: int) -> RecordingFile:
-    """Return the recording of a row."""
     kind, held_out, direction = row["kind"], row["held_out"].lower(), direction_of(row["axis"])
     turned = kind in {"turn", "table"}
     angle, accuracy = (_number(row[name]) for name in OF_TURNS[1:])

@@ -150,7 +150,6 @@ def read_table(
 def _table_of(
     entry: RecordingFile, paths: Sequence[Path], ingest: Ingest, layouts: Sequence[CsvFormat] | None, sensor: Sensor
 ) -> Log:
-    """Read the file or files of one recording as its entry states."""
     if entry.kind != "attitudes":
         return read_table(paths, ingest, layouts, entry.session)
 

@@ -323,7 +323,6 @@ class CompensationStream:
         return Compensated(shaped.get("accelerometer"), shaped.get("gyroscope"))
 
     def _block(self, arrays: Mapping[str, Values]) -> Truths:
-        """Return the truth of each sensor in a block of samples."""
         readings = {s: arrays[s] for s in SENSORS if s in arrays}
         steps = {s: self.steps[s] for s in readings if s in self.steps}
         used = set().union(*(step.used for step in steps.values()))

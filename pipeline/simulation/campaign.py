@@ -495,7 +495,6 @@ def _drawn(unit: UnitDescription, streams: Streams) -> tuple[dict[str, Simulated
 
 
 def _selected(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:
-    """Return the planned recordings that the unit's description selects."""
     unknown = set(unit.recordings) - {p.name for p in planned}
     if unknown:
         known = ", ".join(p.name for p in planned)

@@ -370,7 +370,6 @@ def _bench_note(effects: Iterable[tuple[str, str]]) -> str:
 
 
 def _parser(command: str, description: str | None) -> argparse.ArgumentParser:
-    """Return the parser of add and remove."""
     parser = parser_of(command, description, EPILOG)
     parser.add_argument("campaign", metavar="CAMPAIGN", help="a campaign's name or directory")
     parser.add_argument("unit", metavar="UNIT", nargs="?", help="a unit of units.csv")

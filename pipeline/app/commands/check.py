@@ -388,7 +388,6 @@ def _sheet_proposed(campaign: Campaign, unit: str, saved: SavedProfiles) -> list
 
 
 def _readings_of(campaign: Campaign, unit: str) -> dict[str, Reading]:
-    """Return the recordings of a unit that exist."""
     config = campaign.units[unit].config
     used = f"ingest={config.ingest.name}, sensor={config.sensor.name}, table={config.table.name}"
     found = {}

@@ -87,7 +87,6 @@ class McapLog:
         return self._finish(self.readings.topic)
 
     def _add_calibrated(self, rows: ChannelMessages, decoder: TopicDecoder) -> None:
-        """Add the calibrated messages for some readings."""
         self.readings = self.readings or decoder
         if decoder is not self.readings:
             both = f"{self.readings.topic}, {decoder.topic}"

@@ -174,7 +174,6 @@ def _statistics(job: Job, units: Mapping[str, JSON], parameters: pd.DataFrame, n
 
 
 def _write_campaign(job: Job, units: Mapping[str, JSON], parameters: pd.DataFrame, new: Path, *, packed: bool) -> None:
-    """Write the files that summarise all units."""
     run, rows = job.run, [u["row"] for u in units.values()]
     failures = [u["failure"] for u in units.values() if u["failure"]]
     statistics = _statistics(job, units, parameters, new)

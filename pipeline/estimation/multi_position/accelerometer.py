@@ -195,7 +195,6 @@ class AccelerometerModel:
         return found
 
     def _of_soaks(self, state: State, soaks: Rests) -> EquationBlock:
-        """Return the equations of the parts of soaks."""
         force, C = self.specific_force(state, self.attitudes)[0], contrasts(soaks)
         motion = motion_at_rests(soaks, force[np.searchsorted(self.attitudes.recording, soaks.recording)])
         every = np.sqrt(soaks.variance(self.white))

@@ -130,7 +130,6 @@ def _of_sheet(  # noqa: PLR0917  (what a sheet states)
 def _of_row(  # noqa: PLR0917  (what a row states)
     recording: Recording, index: int, span: slice, bias: Values, entry: RecordingFile, turns: HandTurns
 ) -> StatedTurn:
-    """Return the turn that a row of the sheet states."""
     if not sound_span(recording, span, longest=np.inf):
         raise NotObservableError(
             f"recording {recording.name}: the turn cannot be integrated, as readings of the gyroscope are missing, "

@@ -383,7 +383,6 @@ def posterior(selection: SelectionByHand, hidden: Collection[str]) -> Answers:
 
 
 def _problem(selection: SelectionByHand, effects: Mapping[str, Effect]) -> CandidateProblem:
-    """Return the linear problem at the fit of the selected effects."""
     model, state = selection.model, selection.fits[-1].state
     configured = len(selection.base.state.terms)
     fitted = {term.effect.name: term for term in state.terms[configured:]}

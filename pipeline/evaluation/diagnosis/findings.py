@@ -206,7 +206,6 @@ def _upper_limits(findings: Findings) -> dict[str, dict[str, tuple[float, str]]]
 
 
 def _entry(findings: Findings, name: str) -> Candidate:
-    """Return the entry of an effect in the ranking."""
     score = findings.steps.get(name) or findings.alone[name]
     if name in findings.selected:
         step = findings.selected.index(name)

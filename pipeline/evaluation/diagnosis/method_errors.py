@@ -104,8 +104,6 @@ def given_differences(
 
 @dataclass(frozen=True)
 class _Difference:
-    """The difference of a method from the free fit."""
-
     method: SensorCalibration
     bias: Values  # (3,): M (b - b_m)
     matrices: dict[str, Values]  # (3, 3) parts of E
@@ -234,7 +232,6 @@ def _named(
 
 
 def _size(name: str, difference: _Difference, rms: float, recordings: Sequence[Recording]) -> tuple[float, str]:
-    """Return the size of an error, and its usual unit."""
     sensor = difference.method.sensor
     if name == "bias":
         return float(np.abs(difference.bias).max()), unit_of(sensor)

@@ -224,7 +224,6 @@ def _draws(selection: Selection, scan: Scan, curves: Whitened) -> Iterator[tuple
 
 
 def _curves_of(bases: Sequence[Basis]) -> Curves:
-    """Return the curves of all covariates together."""
     return lambda motion: np.concatenate([curves(motion) for _, curves, _ in bases], axis=1)[:, None]
 
 

@@ -146,11 +146,6 @@ class VerdictInput:
         return self.held_out.error_after**2 > (1.0 - HELPFUL) * self.held_out.error_before**2
 
     @property
-    def too_many(self) -> bool:
-        """Whether more effects were selected than a unit usually has."""
-        return len(self.selected) > BELIEVED
-
-    @property
     def too_quiet(self) -> bool:
         """Whether the residual is too small for the noise estimate."""
         small = self.over_noise is not None and self.over_noise < MIN_RESIDUAL_OVER_NOISE
@@ -235,7 +230,6 @@ def if_observable(verdict: Verdict, ranking: Sequence[object], hidden: Mapping[s
 
 
 def _of_residual(e: VerdictInput) -> str:
-    """Return the figure by which a residual is unexplained."""
     if e.unknown and e.at_noise is not False:
         return decided_words("dependence", named=listed([plain(name) for name in e.unknown]))
     return decided_words("misfit", e.left)
@@ -303,7 +297,7 @@ def _offered(verdict: Verdict, diagnosis: SensorDiagnosis, e: VerdictInput) -> b
     """Return whether to offer the selected effects: if ``unexplained``, each must be plausible and help on held-out."""
     if e.given:
         return False
-    if verdict != Verdict.UNEXPLAINED or e.implausible or e.too_many:
+    if verdict != Verdict.UNEXPLAINED or e.implausible or len(e.selected) > BELIEVED:
         return verdict == Verdict.MISSING_EFFECT
     errors = [(entry.held_out_error_before, entry.held_out_error_after) for entry in diagnosis.chosen]
     lower = [a is not None and b is not None and b**2 < (1.0 - HELPFUL) * a**2 for a, b in errors]

@@ -203,7 +203,6 @@ def _recognised(file: Path, text: str) -> str:
 
 
 def _sensors_in(file: Path, declared: Format, content: Node) -> dict[str, dict[str, str]]:
-    """Return the expressions for the sensors in a file."""
     read_back, endings = declared.read_back, declared.sensor_endings
     expressions = {s: read_back["sensor"] for s in endings if file.stem.endswith(endings[s])} or read_back
     given = {s: expressions[s]["where"].split(" | ") for s in SENSORS if s in expressions}

@@ -121,7 +121,6 @@ def _description(points: Sequence[Point]) -> str:
 
 
 def _row(row: Point, axis: Axis, top: int) -> str:
-    """Return the text of a row, and its bar or its mean."""
     if row.value is None:
         return text(LEFT, top + 11, f"{row.label}: not known", "off")
     label = f"{row.label}: {number(row.value)}" if row.interval else row.label
