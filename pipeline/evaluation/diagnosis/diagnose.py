@@ -97,14 +97,8 @@ def without_harmful(found: SensorDiagnosis, harmful: Mapping[str, str]) -> Senso
     missing = found.verdict == Verdict.MISSING_EFFECT and not left
     head, _, names = found.override.partition("[")
     kept = [name for name in names.rstrip("]").split(",") if name and name not in harmful]
-    return replace(
-        found,
-        verdict=Verdict.UNEXPLAINED if missing else found.verdict,
-        decided_by=decided_words("misfit", found.residual_over_noise) if missing else found.decided_by,
-        selected=left,
-        reason=f"{found.reason} {told[0].upper()}{told[1:]}.".strip(),
-        override=f"{head}[{','.join(kept)}]" if left and found.override else "",
-    )
+    override = f"{head}[{','.join(kept)}]" if left and found.override else ""
+    return replace(_told(found, told, unexplained=missing), selected=left, override=override)
 
 
 def without_impossible(found: SensorDiagnosis, case: DiagnosisInput) -> SensorDiagnosis:
@@ -114,16 +108,16 @@ def without_impossible(found: SensorDiagnosis, case: DiagnosisInput) -> SensorDi
         return found
     told = "; ".join(f"{plain(name)} fits the residual best and is no cause: {why}" for name, why in reasons.items())
     doubted = found.verdict == Verdict.REFERENCE_IN_DOUBT
-    return replace(
-        found,
-        verdict=found.verdict if doubted else Verdict.UNEXPLAINED,
-        decided_by=found.decided_by if doubted else decided_words("misfit", found.residual_over_noise),
-        selected=(),
-        candidates={**found.candidates, **reasons},
-        reason=f"{found.reason} {told[0].upper()}{told[1:]}.".strip(),
-        next_experiment=found.next_experiment if doubted else OTHER_FILE,
-        override="",
-    )
+    found = replace(_told(found, told, unexplained=not doubted), candidates={**found.candidates, **reasons})
+    return replace(found, selected=(), next_experiment=found.next_experiment if doubted else OTHER_FILE, override="")
+
+
+def _told(found: SensorDiagnosis, told: str, *, unexplained: bool) -> SensorDiagnosis:
+    """Return the diagnosis with a further reason, and ``unexplained`` where nothing explains its misfit."""
+    found = replace(found, reason=f"{found.reason} {told[0].upper()}{told[1:]}.".strip())
+    if not unexplained:
+        return found
+    return replace(found, verdict=Verdict.UNEXPLAINED, decided_by=decided_words("misfit", found.residual_over_noise))
 
 
 def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
