@@ -245,10 +245,8 @@ def _of_mapping(row: UnitRow, recordings: Any) -> tuple[UnitRow, UnitFiles]:  # 
     """Return the unit and its files for recordings that are named one by one; those that are not named are absent."""
     if not isinstance(recordings, Mapping):
         kind = type(recordings).__name__
-        raise InputError(
-            "recordings: a folder is expected, or a mapping of names to files or DataFrames, for example "
-            f"{{'recording': frame}}; got {kind}"
-        )
+        problem = "recordings: a folder is expected, or a mapping of names to files or DataFrames"
+        raise InputError(f"{problem}, for example {{'recording': frame}}; got {kind}")
     procedure = row.config.procedure
     if procedure.sheet is not None:
         procedure = procedure.replaced(recordings=sheet_of_mapping(recordings))

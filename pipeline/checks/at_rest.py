@@ -111,10 +111,8 @@ def _doubted(
         louder = float(np.max(static[0] / np.maximum(usual[0], step)))
         quieter = float(np.min(usual[1] / np.maximum(static[1], step)))
         if louder > MAX_TIMES_RESTS * faster:
-            details.append(
-                f"the {sensor} scatters {louder:.3g} times as much as in the rests of the other recordings; "
-                "its noise would be used for all of them"
-            )
+            told = f"the {sensor} scatters {louder:.3g} times as much as in the rests of the other recordings"
+            details.append(f"{told}; its noise would be used for all of them")
         elif quieter > MAX_TIMES_RESTS * slower:
             details.append(
                 f"the {sensor} has at most {1.0 / quieter:.2g} times the white noise of the rests of the other "

@@ -340,10 +340,8 @@ def other_axes(moves: Sequence[MoveByHand]) -> tuple[str, Values | None] | None:
     fewest = min(counts)
     if fewest > as_read / CLEARLY_FEWER:
         return None
-    text = (
-        f"in {as_read} of {len(moves)} moves between rests gravity turns by more than {FAILS_DEG:g} deg otherwise than "
-        f"the angular rates say, and with other axes of the gyroscope in {fewest}"
-    )
+    text = f"in {as_read} of {len(moves)} moves between rests gravity turns by more than {FAILS_DEG:g} deg otherwise"
+    text += f" than the angular rates say, and with other axes of the gyroscope in {fewest}"
     return text, permutations[counts.index(fewest)] if counts.count(fewest) == 1 else None
 
 

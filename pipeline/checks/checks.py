@@ -238,10 +238,8 @@ def _with_settling(recordings: Sequence[Recording]) -> Sequence[Recording]:
         settling = settling_of(recording) if by_hand else None
         if settling is None:
             continue
-        detail = (
-            f"after moves the accelerometer settles with a time constant of {settling.time_s:.2g} s, as with a slow "
-            f"filter; it is settled {settling.left_out_s:.2g} s after a rest was found"
-        )
+        detail = f"after moves the accelerometer settles with a time constant of {settling.time_s:.2g} s,"
+        detail += f" as with a slow filter; it is settled {settling.left_out_s:.2g} s after a rest was found"
         detail += (
             f", and the rests are too short for that: their means are off by {settling.left_g:.2g} g. Rest longer, or "
             "log without this filter"
@@ -274,10 +272,8 @@ def _placed(recordings: list[Recording], table: Table) -> list[Recording]:
     turns = [(k, r) for k, r in enumerate(recordings) if r.axis and not r.up and r.role != "validation"]
     if turns and table.azimuth_of == "turn_axis" and azimuth is not None:
         ends = [f"body {r.axis} to {(azimuth + 90.0 * (1 - r.sense)) % 360.0:g} deg in {r.name}" for _, r in turns]
-        detail = (
-            f"Earth's rotation is in the model: by table.azimuth_deg and the sense of the encoder the shaft points "
-            f"with {', '.join(ends)}, clockwise from north; if it does not, correct table.azimuth_deg by 180 deg"
-        )
+        detail = "Earth's rotation is in the model: by table.azimuth_deg and the sense of the encoder the shaft points"
+        detail += f" with {', '.join(ends)}, clockwise from north; if it does not, correct table.azimuth_deg by 180 deg"
         notes.append((turns[0][0], Note("N-AZIMUTH", len(turns), 0, 0, detail)))
     for k, note in notes:
         recordings[k] = replace(recordings[k], notes=(*recordings[k].notes, note))

@@ -243,10 +243,8 @@ def _applied(
         notes.append(Note("N-MOUNTING", 1, 0, 0, detail))
     if bench.conventional and not as_found:
         return replace(recording, notes=tuple(notes)) if len(notes) > len(recording.notes) else recording
-    detail = (
-        f"{as_found or 'as stated'}, {words(bench)}: the angle used is {bench.sense:+d} times the logged one, "
-        f"{bench.offset:+.6g} deg"
-    )
+    detail = f"{as_found or 'as stated'}, {words(bench)}:"
+    detail += f" the angle used is {bench.sense:+d} times the logged one, {bench.offset:+.6g} deg"
     if bench.vertical:
         detail = f"as stated, body {bench.up} always points up; the angle used is {bench.sense:+d} times the logged one"
     code, settings = ("N-FOUND", ways) if as_found else ("N-MOUNTING", ())
@@ -259,10 +257,8 @@ def _applied(
 def words(bench: TurnMounting) -> str:
     """Return a mounting in words."""
     hand = "right" if bench.sense > 0 else "left"
-    return (
-        f"body {bench.up} up at a table angle of {bench.zero_deg:.1f} deg, the angle counted {hand}-handed about "
-        f"{bench.axis}"
-    )
+    text = f"body {bench.up} up at a table angle of {bench.zero_deg:.1f} deg"
+    return f"{text}, the angle counted {hand}-handed about {bench.axis}"
 
 
 def _departure(turn: TurnRecording, tolerance: float, lean: float) -> _Departure | None:
@@ -290,10 +286,8 @@ def _axis(turn: TurnRecording, tolerance: float, lean: float) -> _Departure | No
         settings = {} if bench is None else _differing(bench, renamed, tolerance)
         return _Departure(turn, "wrong_axis", problem, {"axis": nearest[1], **settings}, bench)
     if fit.turn_axis is not None and off > lean:
-        problem = (
-            f"in {name} gravity turns about an axis that is {off:.1f} deg off body {axis}; {lean:.3g} deg are allowed "
-            "(procedure.mounting_tolerance_deg and what sensor.accelerometer.cross_axis leans)"
-        )
+        problem = f"in {name} gravity turns about an axis that is {off:.1f} deg off body {axis}; {lean:.3g} deg are"
+        problem += " allowed (procedure.mounting_tolerance_deg and what sensor.accelerometer.cross_axis leans)"
         return _Departure(turn, "wrong_axis", problem, {})
     return None
 
@@ -319,10 +313,8 @@ def _face(turn: TurnRecording, found: TurnMounting, tolerance: float) -> _Depart
         if abs(off) <= allowed:
             return None
     code = "wrong_sense" if found.sense != stated.sense else "wrong_face" if found.up != stated.up else "wrong_zero"
-    problem = (
-        f"{turn.name} is mounted otherwise than stated, by more than {allowed:.2g} deg "
-        f"(procedure.mounting_tolerance_deg); stated is {words(stated)}"
-    )
+    problem = f"{turn.name} is mounted otherwise than stated,"
+    problem += f" by more than {allowed:.2g} deg (procedure.mounting_tolerance_deg); stated is {words(stated)}"
     return _Departure(turn, code, problem, _differing(found, stated, tolerance), found)
 
 
@@ -348,10 +340,8 @@ def _vertical(turn: TurnRecording) -> _Departure | None:
         problem = f"in {name} the table is said to turn about {stated.axis}, but gravity stays along body {up}"
         return _Departure(turn, "wrong_axis", problem, {"axis": up[1], "up": up})
     if up != stated.up:
-        problem = (
-            f"in {name} gravity stays along body {up} while the table turns: the turn axis is vertical, and "
-            f"{stated.up} is stated to point up"
-        )
+        problem = f"in {name} gravity stays along body {up} while the table turns:"
+        problem += f" the turn axis is vertical, and {stated.up} is stated to point up"
         return _Departure(turn, "wrong_face", problem, {"up": up})
     if turn.recording.role == "accelerometer":
         problem = f"{name} is for the accelerometer, and about a vertical axis gravity does not turn"

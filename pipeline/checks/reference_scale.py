@@ -354,10 +354,8 @@ def _unit(value: float, units: Units) -> str:
 
 def _wrong_angle(recording: Recording, limits: ChannelLimits, factor: float, against: str) -> IngestError:
     what = _unit(factor, ANGLE_UNITS) or f"is {factor:.4g} times what it should be"
-    message = (
-        f"{limits.column(recording, 'table_angle')} {what}: over {place(recording, 0, recording.samples - 1)} it turns "
-        f"{factor:.4g} times as far as {against} says"
-    )
+    message = f"{limits.column(recording, 'table_angle')} {what}: over {place(recording, 0, recording.samples - 1)} it"
+    message += f" turns {factor:.4g} times as far as {against} says"
     return refusal(recording, "reference_scale", message, "correct ingest.csv.columns.table_angle.unit")
 
 

@@ -277,7 +277,5 @@ def _seats_in_words(slow: Sequence[_Conventional], found: _Seats, allowed: float
         for c, z in zip(slow, found.zeros, strict=True)
         if abs(z) > SMALLEST_DEG / 3.0
     )
-    return (
-        f"the zeros of the turns do not fit together, by more than {allowed:.2g} deg; gravity fits with {settings} "
-        "(docs/mounting.md)"
-    )
+    text = f"the zeros of the turns do not fit together, by more than {allowed:.2g} deg"
+    return f"{text}; gravity fits with {settings} (docs/mounting.md)"

@@ -210,10 +210,8 @@ def require_available(observations: Observations, names: Sequence[str]) -> None:
     for own in SETUP_EFFECTS:
         if setups <= {name.partition("@")[2] for name in names if name.startswith(f"{own}@")}:
             base = "matrix" if own == "mounting" else "bias"
-            raise NotObservableError(
-                f"a separate {own} in every setup ({', '.join(sorted(setups))}) has the same signal as the {base}: "
-                "leave it out for one of them, the reference of the others"
-            )
+            problem = f"a separate {own} in every setup ({', '.join(sorted(setups))}) has the same signal as the {base}"
+            raise NotObservableError(f"{problem}: leave it out for one of them, the reference of the others")
     for name in names:
         this = effect(name)
         lacking = [need for need in this.needs if all(getattr(part.motion, need) is None for part in parts)]

@@ -322,10 +322,8 @@ def assess_noise(  # noqa: PLR0917  (what a fit is)
     count = blocks.weight[:, None]
     spare = len(count) - design.shape[1]
     if spare < 1:
-        raise NotObservableError(
-            f"{len(count)} samples determine {design.shape[1]} parameters and leave none to determine the noise: "
-            "record more samples"
-        )
+        problem = f"{len(count)} samples determine {design.shape[1]} parameters and leave none to determine the noise"
+        raise NotObservableError(f"{problem}: record more samples")
     weight = np.ones(len(design)) if row_weight is None else row_weight
     size = np.sqrt(weight @ design**2 / weight.sum())
     scaled = np.sqrt(count) * (blocks.sums(weight[:, None] * design) / count / np.where(size > 0, size, 1.0))

@@ -63,10 +63,8 @@ def subtracted(
             continue
         if recording.temperature is None:
             if recording.role in needed:
-                raise CannotCalibrateError(
-                    f"{recording.name} logs no temperature, which the known {_names(known)} of the {sensor} need: "
-                    "record it, or choose a method without known effects"
-                )
+                problem = f"{recording.name} logs no temperature, which the known {_names(known)} of the {sensor} need"
+                raise CannotCalibrateError(f"{problem}: record it, or choose a method without known effects")
             found.append(recording.with_readings(**{sensor: None}))
             continue
         motion = replace(motion_at_rest(recording.time), temperature=temperature_of(recording))

@@ -100,10 +100,8 @@ def advice_on_held_out(recordings: Sequence[Recording], procedure: Procedure) ->
     held = sum(map(len, held_out_rests(recordings, procedure).values()))
     if not held:
         return ""
-    return (
-        f". There is no recording for validation, so {held} rests, each with the move before it, are held out of the "
-        "fit: record validation, or use them by procedure.holdout_every=0"
-    )
+    text = f". There is no recording for validation, so {held} rests, each with the move before it"
+    return f"{text}, are held out of the fit: record validation, or use them by procedure.holdout_every=0"
 
 
 def rests_by_use(recordings: Sequence[Recording], procedure: Procedure) -> dict[str, list[dict[str, Any]]]:

@@ -342,10 +342,8 @@ def check_stages(sensor: str, stages: Sequence[str]) -> None:
         for before in stages[:i]:
             lost = [change for change in declared(sensor, before).changes if change not in found.accepts]
             if lost and stage_module(sensor, before) != module:
-                raise ConfigurationError(
-                    f"the stage {stage} cannot follow {before}: it does not honour {_listed(lost)} of {before}; change "
-                    "their order, or leave one of them out"
-                )
+                problem = f"the stage {stage} cannot follow {before}: it does not honour {_listed(lost)} of {before}"
+                raise ConfigurationError(f"{problem}; change their order, or leave one of them out")
 
 
 def _listed(names: Sequence[str]) -> str:

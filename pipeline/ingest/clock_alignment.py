@@ -265,10 +265,8 @@ def fit_clocks(sensor: Log, log: Log) -> ClockFit:
         if fit.correlation > SMALLEST_CORRELATION:
             break
     if not fit.correlation > SMALLEST_CORRELATION:
-        message = (
-            "the table's log does not show the motion that the gyroscope read "
-            f"(correlation {fit.correlation:.2f} at best)"
-        )
+        message = f"the table's log does not show the motion that the gyroscope read (correlation {fit.correlation:.2f}"
+        message += " at best)"
         hint = "do both logs belong to one recording, and are their units right?"
         raise IngestError(message, log.path, code="no_sync", hint=hint)
     if len(order) > 1 and residuals[order[1]] < AMBIGUOUS * residuals[order[0]]:

@@ -85,10 +85,8 @@ def leave_out_disturbances(recording: Recording, note: Callable[[str, Index, str
     row, column = np.unravel_index(int(np.argmax(excess)), excess.shape)
     sensor, axis = where[column]
     events = 1 + int(np.count_nonzero(np.diff(rows) > SAME_EVENT))
-    worst = (
-        f"largest: {sensor} {axis} is {excess[row, column]:.3g} {SENSOR_UNITS[sensor]} beyond what noise and motion "
-        f"allow at {recording.time_ns[row] / 1e9:.9g} s"
-    )
+    worst = f"largest: {sensor} {axis} is {excess[row, column]:.3g} {SENSOR_UNITS[sensor]} beyond what noise and motion"
+    worst += f" allow at {recording.time_ns[row] / 1e9:.9g} s"
     places = f"{rows.size} sample{'s' * (rows.size > 1)} in {events} place{'s' * (events > 1)}"
     if rows.size > most * recording.samples:
         detail = (
@@ -271,10 +269,8 @@ def leave_out_shaken_rests(recording: Recording, note: Callable[[str, Index, str
     rows = np.concatenate([np.arange(a, b) for a, b in pieces[shaken, 2:]])
     sensor, first = divmod(int(np.argmax(excess.T)), len(pieces))
     worst = f"the {[*found][sensor]} scatters {scatter[first, sensor]:.1f} times as usual"
-    detail = (
-        f"{count} of {len(pieces)} pieces of rests left out, in which the unit was shaken or leant on; {worst} at "
-        f"{recording.time[pieces[first, 0]]:.6g} s"
-    )
+    detail = f"{count} of {len(pieces)} pieces of rests left out, in which the unit was shaken or leant on;"
+    detail += f" {worst} at {recording.time[pieces[first, 0]]:.6g} s"
     return without_rows(recording, rows, note("N-SHAKEN", rows, detail))
 
 

@@ -89,10 +89,8 @@ def flag_gaps(table: Log, flags: NDArray[np.uint16], checks: Checks) -> list[Not
     flags[rows] |= GAP
     lengths = steps[rows - 1]
     lost = float(np.sum(lengths - usual)) / float(table.time_ns[-1] - table.time_ns[0])
-    detail = (
-        f"gaps longer than {GAP_INTERVALS} times the median interval of {usual / 1e6:.6g} ms; "
-        f"the longest lasts {lengths.max() / 1e9:.6g} s, {lost:.3%} of the time is missing"
-    )
+    detail = f"gaps longer than {GAP_INTERVALS} times the median interval of {usual / 1e6:.6g} ms;"
+    detail += f" the longest lasts {lengths.max() / 1e9:.6g} s, {lost:.3%} of the time is missing"
     if lost > checks.missing_time:
         message = f"{rows.size} {detail}"
         hint = f"ingest.checks.missing_time allows a share of {checks.missing_time:g}"
@@ -179,10 +177,8 @@ def flag_flat_tops(table: Log, sensor: str, flags: NDArray[np.uint16]) -> list[N
             if not rows.size or share > EQUAL_NEIGHBOUR_SHARE or by_chance > EXPECTED_CHANCE_RUNS:
                 continue
             flags[rows] |= CLIPPED
-            detail = (
-                f"{channel} repeats {end:.6g} {SENSOR_UNITS[sensor]}, the end of its readings, more often than noise "
-                f"allows: clipped below the stated sensor.{sensor}.full_scale, and left out of every fit"
-            )
+            detail = f"{channel} repeats {end:.6g} {SENSOR_UNITS[sensor]}, the end of its readings, more often than"
+            detail += f" noise allows: clipped below the stated sensor.{sensor}.full_scale, and left out of every fit"
             notes.append(table.note("N-CLIP", rows, detail))
     return notes
 
@@ -333,10 +329,8 @@ def _check_rate(table: Log, checks: Checks) -> None:
     for factor, times in _OTHER_FACTORS.items():
         if abs(ratio * factor - 1.0) <= RATE_TOLERANCE:
             unit = f"; the numbers look like {times}"
-    message = (
-        f"the median interval is {interval_us:g} us, and ingest.checks.rate_hz of {checks.rate_hz:g} Hz expects "
-        f"{1e6 / checks.rate_hz:g} us{unit}"
-    )
+    message = f"the median interval is {interval_us:g} us,"
+    message += f" and ingest.checks.rate_hz of {checks.rate_hz:g} Hz expects {1e6 / checks.rate_hz:g} us{unit}"
     hint = "correct ingest.csv.columns.time.unit or ingest.checks.rate_hz"
     raise IngestError(message, table.path, code="wrong_rate", hint=hint)
 
@@ -356,10 +350,8 @@ def _check_force(table: Log) -> None:
             hint = f"the numbers look like {unit}"
     if usual > 1500.0:
         hint = "the numbers look like raw counts, which need counts_per_unit"
-    message = (
-        f"median specific force is {usual:.4g} g, and a log of rests and turns has about 1 g (allowed {low} to "
-        f"{high}): {hint}; correct ingest.csv.columns.accel_x.unit (accel_y, accel_z)"
-    )
+    message = f"median specific force is {usual:.4g} g, and a log of rests and turns has about 1 g (allowed {low} to"
+    message += f" {high}): {hint}; correct ingest.csv.columns.accel_x.unit (accel_y, accel_z)"
     raise IngestError(message, table.path, code="implausible_force")
 
 
@@ -370,10 +362,8 @@ def _check_attitude(table: Log) -> None:
     wrong = np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)
     if wrong.size:
         row = int(wrong[0])
-        message = (
-            f"the table's quaternion has the length {norm[row]:.4g} at {table.time_ns[row] / 1e9:.9g} s "
-            f"({wrong.size} such samples); 1 is expected"
-        )
+        message = f"the table's quaternion has the length {norm[row]:.4g} at {table.time_ns[row] / 1e9:.9g} s"
+        message += f" ({wrong.size} such samples); 1 is expected"
         raise IngestError(message, table.place(row), code="bad_attitude")
 
 

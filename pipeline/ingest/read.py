@@ -274,10 +274,8 @@ def _check_different(recordings: Sequence[Recording]) -> None:
             key = file["sha256"], recording.source.get("session")
             twin, first = seen.setdefault(key, (recording.name, file["file"]))
             if twin != recording.name:
-                message = (
-                    f"recordings {twin} and {recording.name} are the same file, byte for byte ({first}); each needs "
-                    "its own"
-                )
+                message = f"recordings {twin} and {recording.name} are the same file, byte for byte ({first});"
+                message += " each needs its own"
                 raise IngestError(message, file["file"], code="same_file")
 
 

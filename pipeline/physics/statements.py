@@ -350,14 +350,10 @@ def not_determined(part: Mapping[str, Any]) -> str:
         axes = next((d for stage in part["stages"] if (d := stage["details"].get("turn_axes"))), None)
         if axes and axes["stated_deg"] > axes["needed_deg"]:
             needed = np.floor(100.0 * axes["needed_deg"]) / 100.0
-            ways.append(
-                f"set procedure.turns.axis_accuracy_deg (now {axes['stated_deg']:g}) to {needed:g} or less, where the "
-                "axes of the turns are known so well"
-            )
-        ways.append(
-            "log the accelerometer too, in rests in many attitudes with moves between them, or before and after turns "
-            "by 90 and -90 deg about each axis with gravity across it"
-        )
+            told = f"set procedure.turns.axis_accuracy_deg (now {axes['stated_deg']:g}) to {needed:g} or less"
+            ways.append(f"{told}, where the axes of the turns are known so well")
+        told = "log the accelerometer too, in rests in many attitudes with moves between them"
+        ways.append(f"{told}, or before and after turns by 90 and -90 deg about each axis with gravity across it")
         return f"the recordings do not determine {names} better than the limit of the sensor file: {', or '.join(ways)}"
     return f"the rests do not determine {names} better than the limit of the sensor file: {advice}"
 

@@ -353,10 +353,8 @@ def programs_of(units: Sequence[UnitDescription]) -> dict[str, str]:
         if unit.log.kind == BY_PROGRAM:
             text = _procedure_text(unit.procedure, course_of(unit))
             if found.setdefault(columns_of(unit)["procedure"], text) != text:
-                raise ConfigurationError(
-                    f"unit {unit.unit}: its table follows another program than those of the units before; simulate it "
-                    "as a separate campaign"
-                )
+                problem = f"unit {unit.unit}: its table follows another program than those of the units before"
+                raise ConfigurationError(f"{problem}; simulate it as a separate campaign")
     return found
 
 

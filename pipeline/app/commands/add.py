@@ -223,10 +223,8 @@ def _value(layers: Sequence[Layer], key: str) -> list[str]:
         elif name != key:
             continue
         if not isinstance(value, list):
-            raise ConfigurationError(
-                f"{text} ({origin}): the effects are no list, so none can be added to or removed from it; "
-                f"write {key}=[...] there"
-            )
+            problem = f"{text} ({origin}): the effects are no list, so none can be added to or removed from it"
+            raise ConfigurationError(f"{problem}; write {key}=[...] there")
         effects = [str(v) for v in value]
     return effects
 

@@ -436,10 +436,8 @@ def _recipe(reading: Reading, parts: int) -> str:
     if not reading.of_campaign:
         return "To use all parts, check the file where it lies in your campaign: check then prints the settings."
     if entry.windows:
-        return (
-            "The procedure cuts this recording into windows, and its time falls back within it. Write a file for each "
-            "window, or one file whose time never falls back (docs/record.md, Parts)."
-        )
+        text = "The procedure cuts this recording into windows, and its time falls back within it"
+        return f"{text}. Write a file for each window, or one file whose time never falls back (docs/record.md, Parts)."
     here = {k: v for k, v in entry.json_value.items() if v is not None or k == "axis"}
     lines = [f"procedure.recordings.{name}.session=1"]
     for part in range(2, parts + 1):

@@ -51,10 +51,8 @@ def main(argv: Sequence[str]) -> int:
     table = shipped_settings(table=table_name).table
     if (table.motion == "none") == (procedure_name in TABLE_PROCEDURES):
         known = ", ".join(TABLE_PROCEDURES)
-        raise ConfigurationError(
-            f"procedure {procedure_name} does not fit table {table_name}: {known} need a table, the others need none "
-            "(table hand); docs/record.md shows both"
-        )
+        problem = f"procedure {procedure_name} does not fit table {table_name}: {known} need a table"
+        raise ConfigurationError(f"{problem}, the others need none (table hand); docs/record.md shows both")
     bench = described({"sensor": sensor_name, "table": table_name, "procedure": procedure_name})
     unit = UnitDescription(arguments.unit, **bench)
     sheet = procedure.get("sheet")

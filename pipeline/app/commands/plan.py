@@ -99,11 +99,8 @@ def _described_unit(arguments: argparse.Namespace) -> UnitDescription | None:
     if campaign is not None:
         source = campaign / DESCRIPTION_FILE
         if campaign.is_dir() and not source.is_file():
-            raise ConfigurationError(
-                f"this campaign has no {DESCRIPTION_FILE}, so its procedure is unknown; "
-                "give its sensor, table, procedure and course as options",
-                str(campaign),
-            )
+            problem = f"this campaign has no {DESCRIPTION_FILE}, so its procedure is unknown; give its sensor, table"
+            raise ConfigurationError(f"{problem}, procedure and course as options", str(campaign))
     if source is None:
         if name is not None:
             raise ConfigurationError("--unit chooses a unit of a description; give one by --from or --campaign")

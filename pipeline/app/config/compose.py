@@ -223,10 +223,8 @@ class Composer:
             except ConfigurationError as error:
                 raise SettingProblem(f"method.{sensor}={name}: {error.message} (configs/method/{name}.yaml)") from None
             if not any({"bias", "matrix"} & {*declared(sensor, stage).changes} for stage in stages[sensor]):
-                raise SettingProblem(
-                    f"method.{sensor}={name}: no stage fits bias or matrix: add one that does, such as "
-                    f"reference_least_squares (configs/method/{name}.yaml)"
-                )
+                problem = f"method.{sensor}={name}: no stage fits bias or matrix: add one that does"
+                raise SettingProblem(f"{problem}, such as reference_least_squares (configs/method/{name}.yaml)")
         unused = {} if GIVEN in (method.accelerometer, method.gyroscope) else {"file": None, "format": None}
         return method.replaced(stages=Stages(**stages), **unused)
 

@@ -99,10 +99,8 @@ def read_units_table(path: Path) -> UnitsTable:
         elif name in units:
             problems.append(f"line {line}: unit {name!r} stands twice")
         elif twin != name:
-            problems.append(
-                f"line {line}: units {twin!r} and {name!r} differ in upper and lower case only; their files would be "
-                "the same on disks that make no difference; rename one"
-            )
+            told = f"line {line}: units {twin!r} and {name!r} differ in upper and lower case only"
+            problems.append(f"{told}; their files would be the same on disks that make no difference; rename one")
         else:
             units[name], lines[name] = row, line
     if not units and not problems:
@@ -128,10 +126,8 @@ def _hint(columns: list[str]) -> str:
     """Describe a header without a column ``unit``, and what to do."""
     for sign, name in ((";", "semicolons"), ("\t", "tabs")):
         if len(columns) < 2 and columns and "unit" in [c.strip() for c in columns[0].split(sign)]:
-            return (
-                f": its columns are separated by {name}, where commas are expected; save it again as CSV with commas "
-                "(quote a cell that holds a comma)"
-            )
+            text = f": its columns are separated by {name}, where commas are expected"
+            return f"{text}; save it again as CSV with commas (quote a cell that holds a comma)"
     close = difflib.get_close_matches("unit", columns, 1, SIMILARITY)
     names = ", ".join(repr(c[:60])[1:-1] for c in columns[:20])
     return (f"; nearest: {close[0]}" if close else "") + f"; its columns are {names or 'none'}"

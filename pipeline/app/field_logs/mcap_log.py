@@ -60,10 +60,8 @@ class McapLog:
         if self.settings.topics:
             topics = [t for t, fields in self.settings.topics.items() if READING_CHANNELS & set(fields)]
             if len(topics) != 1:
-                message = (
-                    f"the profile takes the readings from {len(topics)} topics ({', '.join(topics)}); apply needs both "
-                    "sensors in the same messages"
-                )
+                message = f"the profile takes the readings from {len(topics)} topics ({', '.join(topics)});"
+                message += " apply needs both sensors in the same messages"
                 raise IngestError(message, str(self.source), code="unsupported")
             topic = topics[0]
         if needed:

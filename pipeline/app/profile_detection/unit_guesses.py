@@ -216,10 +216,8 @@ def counts_of_sensor(guess: Guess, name: str, sensor: Sensor | None) -> Guess:
     if sensor is None:
         text = f'{guess.evidence}; "{figure}" takes counts_per_unit from the configuration of the sensor and its range'
         return Guess(guess.entry, text)
-    text = (
-        f"{guess.evidence}; counts_per_unit is that of sensor={sensor.name}, {sensor.of(name).counts_per_unit:g}: "
-        f"sensor.{name}.range must be the range that the logger sets"
-    )
+    text = f"{guess.evidence}; counts_per_unit is that of sensor={sensor.name}, {sensor.of(name).counts_per_unit:g}:"
+    text += f" sensor.{name}.range must be the range that the logger sets"
     return Guess({**guess.entry, "counts_per_unit": figure}, text)
 
 

@@ -302,10 +302,8 @@ def _fitted(
     try:
         columns.require_full_rank(PARAMETER_NAMES.tolist())
     except NotObservableError as lack:
-        raise NotObservableError(
-            f"the {len(rows.rests.time)} orientations are too much alike: {lack.message} ({_unused(rows)}). Record "
-            "rests with each axis up, down and level, spread evenly"
-        ) from lack
+        problem = f"the {len(rows.rests.time)} orientations are too much alike: {lack.message} ({_unused(rows)})"
+        raise NotObservableError(f"{problem}. Record rests with each axis up, down and level, spread evenly") from lack
     if not partly:  # far from a minimum that the orientations hardly determine, the fit would name others
         _require_known(np.linalg.norm(columns.weights(), axis=1), rows)
     known = WanderPrior(0.0, prior.time) if not rows.by_hand else prior

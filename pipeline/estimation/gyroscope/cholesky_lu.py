@@ -345,10 +345,8 @@ def require_turns(U: Values) -> None:
     missing = [axis for axis, angle in zip(AXES, total, strict=True) if angle <= 1e-3 * largest or largest == 0.0]
     if missing or np.linalg.matrix_rank(U, tol=1e-3 * largest) < 3:
         about = f"about {' and '.join(missing)}" if missing else "about three independent axes"
-        raise NotObservableError(
-            f"the gyroscope was not turned {about}: record a turn about each of x, y and z, from rest to rest, at "
-            "20 deg/s or more"
-        )
+        problem = f"the gyroscope was not turned {about}: record a turn about each of x, y and z, from rest to rest"
+        raise NotObservableError(f"{problem}, at 20 deg/s or more")
 
 
 class KnownTurns(NamedTuple):

@@ -144,10 +144,8 @@ def fit(task: StageInput) -> SensorCalibration:
         equations = part.equations(start)
         base = equations.base
         if ScaledColumns.of(base, MIN_NEW_NORM_SHARE).rank < base.shape[1]:
-            raise CannotCalibrateError(
-                "the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: "
-                f"{advice}"
-            )
+            problem = "the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis"
+            raise CannotCalibrateError(f"{problem}: {advice}")
         found = fit_robustly(part, partial(fit_model, known=(equations, None)), filtered)
         # limits and axes are of the case: no gyroscope shows the frame of the accelerometer in it
         return found, np.sqrt(np.maximum(np.diag(found[1].covariance)[MATRIX] - of_frame, 0.0))

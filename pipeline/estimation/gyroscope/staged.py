@@ -233,10 +233,8 @@ class Response:
         """Raise ``NotObservableError`` where there is no turn about one of the axes."""
         missing = [axis for axis, rate in zip(AXES, self.rate, strict=True) if rate == 0.0]
         if missing:
-            raise NotObservableError(
-                f"the gyroscope was not turned steadily about {' and '.join(missing)}: record a turn at a constant "
-                "rate about each of x, y and z"
-            )
+            problem = f"the gyroscope was not turned steadily about {' and '.join(missing)}"
+            raise NotObservableError(f"{problem}: record a turn at a constant rate about each of x, y and z")
 
 
 @dataclass(frozen=True)

@@ -187,10 +187,8 @@ def require_turns(found: Sequence[tuple[str, str]], moves: Sequence[HandMove], t
     ``found``: recording and axis of each turn.
     """
     expected = f"a multiple of {turns.angle_deg:g} deg, within a tenth of it and a quarter of that angle"
-    advice = (
-        "turn the unit from rest to rest about each body axis, and state the angle in procedure.turns.angle_deg; an "
-        "angle that is wrong in all turns shows a wrong unit or range of the gyroscope"
-    )
+    advice = "turn the unit from rest to rest about each body axis, and state the angle in procedure.turns.angle_deg;"
+    advice += " an angle that is wrong in all turns shows a wrong unit or range of the gyroscope"
 
     for part in {id(r): r for r, _, _ in moves if r.axis is not None}.values():
         if (part.name, str(part.axis)) not in found:

@@ -561,7 +561,5 @@ def require_observable(model: Model, fitted: FitByHand, limits: Limits) -> None:
     loose = [name for name, each in zip(names, weak[-len(names) :], strict=True) if each]
     if lost or loose:
         advice = "; ".join(f"{e.name} needs {e.excitation}" for e in lost or [t.effect for t in fitted.state.terms])
-        raise NotObservableError(
-            f"the rests of the {model.sensor} do not determine {', '.join([e.name for e in lost] or loose)}: {advice}; "
-            f"or take it out of effects.{model.sensor}"
-        )
+        problem = f"the rests of the {model.sensor} do not determine {', '.join([e.name for e in lost] or loose)}"
+        raise NotObservableError(f"{problem}: {advice}; or take it out of effects.{model.sensor}")

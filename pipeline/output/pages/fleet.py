@@ -333,10 +333,8 @@ def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
         change = f"{'falls' if last < first else 'rises'} from {number(first)} to {number(last)}"
     ratio = f", {number(last / floor)} × the noise floor" if floor else ""
     finding = f"{sensor.capitalize()}: in the last run the error of the {error.kind} {change} {unit}{ratio}"
-    caption = (
-        "Error after each run that changed the unit, on held-out motion where a run had any, and the effects that it "
-        "added or removed."
-    )
+    caption = "Error after each run that changed the unit, on held-out motion where a run had any,"
+    caption += " and the effects that it added or removed."
     figure = Figure(f"history-{sensor}", finding, caption)
     return bars(figure, rows, f"rms error, {unit} (logarithmic)", levels={f"noise floor {number(floor)}": floor or 0.0})
 

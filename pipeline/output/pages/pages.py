@@ -300,10 +300,8 @@ def monte_carlo_of(budget: JSON) -> JSON | None:
     rows = [j for j, U in enumerate(run["expanded_uncertainty"]) if U > 0.0]
     validated = sum(run["validated"][j] for j in rows)
     digit = "second" if run["digits"] == 2 else "first"
-    finding = (
-        f"Monte Carlo, {run['trials']:,} trials: the interval of {validated} of {len(rows)} parameters agrees with the "
-        f"budget's to half a unit of the {digit} digit of u."
-    )
+    finding = f"Monte Carlo, {run['trials']:,} trials: the interval of {validated} of {len(rows)} parameters agrees"
+    finding += f" with the budget's to half a unit of the {digit} digit of u."
     if validated < len(rows):
         finding += " Where it does not, use the Monte Carlo interval."
     return {"finding": finding, "rows": rows}

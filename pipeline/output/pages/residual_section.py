@@ -281,10 +281,8 @@ def _covariate(sensor: str, label: str, mean: _BinnedMean, wander: Values) -> Fi
         spread = np.abs(mean.mean) / np.sqrt(mean.error**2 + wander**2)
         row, worst = np.unravel_index(int(np.nanargmax(spread)), spread.shape)
         at, size, sigmas = (float(v) for v in (mean.centre[row], mean.mean[row, worst], spread[row, worst]))
-        finding = (
-            f"Not flat against {words}: {number(size)} {unit} on {AXES[worst]} at {number(at)} {covariate_unit}, "
-            f"{number(sigmas, 2)} σ"
-        )
+        finding = f"Not flat against {words}:"
+        finding += f" {number(size)} {unit} on {AXES[worst]} at {number(at)} {covariate_unit}, {number(sigmas, 2)} σ"
     figure = Figure(f"{sensor}-residual-{name.replace(' ', '-')}", finding, quiet=excess < FLAT)
     means = f"Means in bins; on the worst axis their mean square is {number(excess)} times that of noise and wander."
     return chart(figure, means, panels, label, kind="angle" if name == "angle" else "")

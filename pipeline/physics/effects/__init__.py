@@ -270,10 +270,8 @@ def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
 def _problem_of(found: object, name: str) -> str:
     """Return why the ``EFFECT`` of a Python file is unusable; empty if it is usable."""
     if not isinstance(found, Effect):
-        return (
-            "holds no effect: EFFECT = MyEffect() is expected, of a class derived from "
-            "pipeline.physics.effects.base.Effect (see docs/effects_of_your_own.md)"
-        )
+        text = "holds no effect: EFFECT = MyEffect() is expected"
+        return f"{text}, of a class derived from pipeline.physics.effects.base.Effect (see docs/effects_of_your_own.md)"
     lacking = [attribute for attribute in OF_PYTHON if not hasattr(found, attribute)]
     if lacking:
         return f"its EFFECT lacks {', '.join(lacking)}"

@@ -171,10 +171,8 @@ class FormulaEffect(DeclaredEffect):
             return values[(slice(None), *place, None)]
         if name in OF_THE_TURN:
             return None
-        raise InputError(
-            f"effect {self.name} depends on the {name}, but the recording{_of(motion, '')} holds none; "
-            "record it, or remove the effect from the configuration"
-        )
+        problem = f"effect {self.name} depends on the {name}, but the recording{_of(motion, '')} holds none"
+        raise InputError(f"{problem}; record it, or remove the effect from the configuration")
 
     def _check_finite(self, signals: MotionSignals, motion: Motion) -> None:
         """Raise ``InputError`` for a formula that is not finite where its signals are finite."""

@@ -218,10 +218,8 @@ def _require_below_nyquist(key: str, frequency: float | None, interval: float) -
     if frequency is None:
         raise ConfigurationError(f"filter.{key} is null; this filter needs it, in Hz, below {nyquist:.4g} Hz")
     if not 0.0 < frequency < nyquist:
-        raise ConfigurationError(
-            f"filter.{key} is {frequency:g} Hz, but the readings come every {interval:.4g} s: it must lie between 0 "
-            f"and half the sampling rate, {nyquist:.4g} Hz"
-        )
+        problem = f"filter.{key} is {frequency:g} Hz, but the readings come every {interval:.4g} s"
+        raise ConfigurationError(f"{problem}: it must lie between 0 and half the sampling rate, {nyquist:.4g} Hz")
 
 
 def _butterworth_sections(settings: Filter, interval: float) -> Values:

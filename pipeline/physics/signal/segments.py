@@ -174,11 +174,8 @@ def _segment_of_window(recording: Recording, window: Window) -> Segment:
     since = recording.time - recording.time[0]
     start, stop = np.searchsorted(since, [window.start_s, window.stop_s])
     if stop - start < 2:
-        raise InputError(
-            f"the window from {window.start_s:g} to {window.stop_s:g} s holds {stop - start} samples; the "
-            f"recording is {since[-1]:.2f} s long",
-            recording.source.get("file"),
-        )
+        problem = f"the window from {window.start_s:g} to {window.stop_s:g} s holds {stop - start} samples"
+        raise InputError(f"{problem}; the recording is {since[-1]:.2f} s long", recording.source.get("file"))
     role, axis = window.role, window.axis
     return Segment(int(start), int(stop), role, axis, f"{role} about {axis}" if axis else role)
 
@@ -189,11 +186,8 @@ def _find_segments(recording: Recording) -> list[Segment]:
     if rate is None and recording.table_attitude is not None:
         rate = rate_of_attitude(recording.time, recording.table_attitude)
     if rate is None or gyro is None:
-        raise InputError(
-            "the recording is to be cut into its turns, and it holds no gyroscope or no log of the table; give windows "
-            "in procedure.recordings",
-            recording.source.get("file"),
-        )
+        problem = "the recording is to be cut into its turns, and it holds no gyroscope or no log of the table"
+        raise InputError(f"{problem}; give windows in procedure.recordings", recording.source.get("file"))
     session = _Session(recording, rate, gyro)
     segments = [segment for group in session.groups for segment in session.segments(group)]
     segments += session.static(segments)
