@@ -121,9 +121,8 @@ def _turns(
         if r.axis is not None and not (r.table_angle is None and r.table_rate is None):
             stated, fit = stated_bench(procedure.recordings.get(r.name), table, r.axis), fit_turn(r)
             of_zero = tolerance + offset_s * abs(fit.mean_rate) + lost * fit.arc
-            turns.append(
-                TurnRecording(r, stated, fit, found_bench(fit, r.axis), r.name in procedure.recordings, of_zero)
-            )
+            found, own = found_bench(fit, r.axis), r.name in procedure.recordings
+            turns.append(TurnRecording(r, stated, fit, found, own, of_zero))
     return turns
 
 
@@ -322,9 +321,8 @@ def _differing(found: TurnMounting, stated: TurnMounting, tolerance: float) -> d
     """Return the settings by which the mounting by gravity differs from the stated one."""
     settings = {} if found.up == stated.up else {"up": found.up}
     settings |= {} if found.sense == stated.sense else {"sense": f"{found.sense}"}
-    return settings | (
-        {"zero_deg": f"{found.zero_deg:.1f}"} if abs(found.zero_deg - stated.zero_deg) > tolerance else {}
-    )
+    off = abs(found.zero_deg - stated.zero_deg) > tolerance
+    return settings | ({"zero_deg": f"{found.zero_deg:.1f}"} if off else {})
 
 
 def _vertical(turn: TurnRecording) -> _Departure | None:

@@ -123,9 +123,8 @@ def json_text(value: Any, levels: int = 3, indent: str = "\n") -> str:  # noqa: 
     if levels and isinstance(value, dict | list) and value:
         members = list(value.values() if isinstance(value, dict) else value)
         if any(isinstance(member, dict | list | tuple) for member in members):
-            names = (
-                [f"{encode_basestring(str(n))}: " for n in value] if isinstance(value, dict) else [""] * len(members)
-            )
+            keyed = isinstance(value, dict)
+            names = [f"{encode_basestring(str(n))}: " if keyed else "" for n in value]
             inner = indent + " "
             lines = [name + json_text(m, levels - 1, inner) for name, m in zip(names, members, strict=True)]
             opening, closing = "{}" if isinstance(value, dict) else "[]"

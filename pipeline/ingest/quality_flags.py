@@ -248,9 +248,8 @@ def flag_stuck(table: Log, found: Mapping[str, Index], flags: NDArray[np.uint16]
         if not where:
             detail += f", for {(table.time_ns[last] - table.time_ns[first]) / 1e9:.3g} s"
         if not where and "table_angle" in table.values:
-            detail += (
-                f" while the table turns by {abs(np.subtract(*table.values['table_angle'][[last, first]])):.3g} deg"
-            )
+            turned = abs(np.subtract(*table.values["table_angle"][[last, first]]))
+            detail += f" while the table turns by {turned:.3g} deg"
         if not where and same is not None and same[first:last].all() and equal_share(same) <= EQUAL_NEIGHBOUR_SHARE:
             detail += ", and the temperature with them"
         notes.append(table.note("N-STUCK", rows, f"{detail}: stuck, and left out of every fit"))

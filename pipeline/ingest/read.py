@@ -303,9 +303,8 @@ def read_attitudes(path: Path, layouts: Sequence[CsvFormat], sensor: Sensor, che
     columns = tuple(c for c in layouts[0].columns if c.channel != TIME)
     from imu_logs.text_read import read_csv  # noqa: PLC0415  (pyarrow, for tables of means)
 
-    table = read_csv(
-        [path], [layouts[0].model_copy(update={"columns": columns, "rate_hz": 1.0 / BETWEEN_ROWS_S})], checks
-    )
+    layout = layouts[0].model_copy(update={"columns": columns, "rate_hz": 1.0 / BETWEEN_ROWS_S})
+    table = read_csv([path], [layout], checks)
     assert table.lines is not None  # noqa: S101  (of text)
     starts = _starts(path, layouts[0], table.lines)
     number = np.cumsum(starts) - 1

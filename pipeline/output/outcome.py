@@ -213,9 +213,8 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     lines += lines_of(beyond_limits_groups(rows))
     lines += lines_of(_not_in_uncertainty(rows).items())
     for column, words in (("left_out", "left out"), ("incomplete", "not complete")):
-        lines += shortened(
-            [f"{r['unit']}, {words}: {w}" for r in rows if (w := r.get(column))], NAMED_PER_LINE, "units"
-        )
+        told = [f"{r['unit']}, {words}: {w}" for r in rows if (w := r.get(column))]
+        lines += shortened(told, NAMED_PER_LINE, "units")
     entries = read_history(results) if of_this_run else []
     if entries:
         lines += shortened(_changes(entries), NAMED_PER_LINE, "sensors that changed")

@@ -106,9 +106,8 @@ def read_calibration(file: Path) -> dict[str, Any]:
     try:
         if file.exists() and (other := not_regular(file)):
             _refuse(file, f"this {other}")
-        document = json.loads(
-            read_published(file).decode(), object_pairs_hook=_without_repeats, parse_constant=_not_finite
-        )
+        text = read_published(file).decode()
+        document = json.loads(text, object_pairs_hook=_without_repeats, parse_constant=_not_finite)
     except FileNotFoundError:
         raise MissingInputError("there is no such calibration", str(file)) from None
     except (OSError, RecursionError, ValueError) as error:  # ValueError: no UTF-8, no JSON, or refused below

@@ -56,9 +56,8 @@ class Signal(NamedTuple):
 
 
 def _vector(prefix: str, field: str, meaning: str, c: str) -> dict[str, Signal]:
-    return {
-        f"{prefix}{a}": Signal(meaning.format(axis=f"body {a}"), field, (i,), c.format(i)) for i, a in enumerate("xyz")
-    }
+    axes = [(i, a, meaning.format(axis=f"body {a}")) for i, a in enumerate("xyz")]
+    return {f"{prefix}{a}": Signal(words, field, (i,), c.format(i)) for i, a, words in axes}
 
 
 SIGNALS = {

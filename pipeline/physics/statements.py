@@ -139,9 +139,8 @@ def _open(
     for name, reason in reasons.items():
         owner, _, plain = name.rpartition(".")
         within = [f"{owner}.{other}".lstrip(".") for other in effect(plain).contains]
-        seen = [
-            _largest(calibration, other) for other in within if other in calibration.at_limits and other not in reasons
-        ]
+        known = [other for other in within if other in calibration.at_limits and other not in reasons]
+        seen = [_largest(calibration, other) for other in known]
         a = np.clip(_largest(calibration, name) - np.max([*seen, np.zeros(len(U))], axis=0), 0.0, None)
         if name not in contained | fitted and np.any(a > NEGLIGIBLE * U):
             yield name, a, reason

@@ -338,9 +338,8 @@ def as_program(program: Program) -> list[ProgramRest | ProgramTurn | Repeated]:
 
 def columns_of(unit: UnitDescription) -> dict[str, str]:
     """Return the columns of ``units.csv`` that the unit's table log requires."""
-    return {BY_FILE: {"ingest": INGEST}, BY_PROGRAM: {"procedure": f"{unit.procedure}_commanded"}}.get(
-        unit.log.kind, {}
-    )
+    columns = {BY_FILE: {"ingest": INGEST}, BY_PROGRAM: {"procedure": f"{unit.procedure}_commanded"}}
+    return columns.get(unit.log.kind, {})
 
 
 def programs_of(units: Sequence[UnitDescription]) -> dict[str, str]:
@@ -403,9 +402,8 @@ def write_campaign(
         progress(f"{unit.unit}: {sum(r.samples for r in recordings)} samples in {len(recordings)} recordings")
     table = pd.DataFrame(_sheet_rows(description), dtype=object)
     columns = [*(c for c in UNITS_CSV_COLUMNS if c in table), *(c for c in table if c not in UNITS_CSV_COLUMNS)]
-    (directory / "units.csv").write_text(
-        table.to_csv(columns=columns, index=False, lineterminator="\n"), encoding="utf-8"
-    )
+    text = table.to_csv(columns=columns, index=False, lineterminator="\n")
+    (directory / "units.csv").write_text(text, encoding="utf-8")
     if not (directory / "campaign.yaml").exists():
         moves = all(unit.procedure == "multi_position" for unit in description.units)
         overrides = "method=rests_and_moves" if moves else ""  # as ``new`` writes it: the moves calibrate the gyroscope

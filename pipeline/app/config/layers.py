@@ -88,9 +88,7 @@ def read_units_table(path: Path) -> UnitsTable:
             problems.append(f"line {line}: {len(columns)} columns expected, as in the header")
             continue
         row = {k: v.strip() for k, v in raw.items()}
-        problems += [
-            f"line {line}: column {k!r} holds a control character" for k, v in row.items() if CONTROL.search(v)
-        ]
+        problems += [f"line {line}: column {k!r} holds a control character" for k in row if CONTROL.search(row[k])]
         name = row["unit"]
         problem = wrong_name(name)
         twin = by_lower_case.setdefault(name.casefold(), name)

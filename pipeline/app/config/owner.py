@@ -187,9 +187,8 @@ def _difference_of_truth(campaign: Campaign) -> str:
         origin = names.index(unit.copy_of or unit.unit)
         expected: dict[str, Any] = true_parameters(description.units[origin], description.seed, origin)
         written = read_json(file)
-        if not isinstance(written, dict) or any(
-            written.get(k) != v for k, v in json.loads(json.dumps(expected)).items()
-        ):
+        true = json.loads(json.dumps(expected))
+        if not isinstance(written, dict) or any(written.get(k) != v for k, v in true.items()):
             return f"the true parameters of unit {unit.unit} are others"
         equal += 1
     return "" if equal else "no unit is in both"

@@ -81,10 +81,8 @@ class LogChecks:
         """Raise ``InputError`` if samples are beyond the soaked temperatures."""
         if self.soaked and TEMPERATURE_RANGE in self.extremes:
             count, least, most = self.extremes[TEMPERATURE_RANGE]
-            message = (
-                f"--strict: {count:.0f} samples at {least:.1f} to {most:.1f} degC are beyond the soaked temperatures"
-            )
-            raise InputError(f"{message}, {self.soaked[0]:.1f} to {self.soaked[1]:.1f} degC", file)
+            message = f"--strict: {count:.0f} samples at {least:.1f} to {most:.1f} degC are beyond the soaked"
+            raise InputError(f"{message} temperatures, {self.soaked[0]:.1f} to {self.soaked[1]:.1f} degC", file)
 
     def check_decimals(self, columns: Sequence[Any], decimal: str) -> None:
         """Check whether the readings of a text log have the decimals that ``apply`` writes."""

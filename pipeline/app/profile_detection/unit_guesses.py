@@ -169,9 +169,8 @@ def slope(rate: Values, table: Values) -> float | None:
 
 def _usual_counts(measured: float, close: float) -> tuple[dict[str, Any], str]:
     """Return the entry of a gyroscope in counts, with the usual counts per deg/s if they are close, and a remark."""
-    known, usual = (
-        min(cs, key=lambda c: abs(np.log(measured / c))) for cs in (factors_of_sensors(), USUAL_COUNTS_PER_DPS)
-    )
+    tables = factors_of_sensors(), USUAL_COUNTS_PER_DPS
+    known, usual = (min(counts, key=lambda c: abs(np.log(measured / c))) for counts in tables)
     usual = usual if abs(usual / known - 1) < SAME_FACTOR else known
     if abs(measured / usual - 1) < close:
         return {"unit": COUNTS, "counts_per_unit": usual}, f"; {usual:g} is the usual number near it"
@@ -363,9 +362,7 @@ class ByMotion(Evidence):
             index, columns.turn = next(((i, turn) for i, turn in turns if turn), (named, None))
             if columns.turn and index is not None:
                 columns.others["table_angle"] = index
-                what = (
-                    f"{names[index]} is taken as the table's encoder by its numbers" if named is None else names[index]
-                )
+                what = names[index] + " is taken as the table's encoder by its numbers" * (named is None)
                 remark = "check counts and sign, and add offset, the count at angle 0"
                 if unit_of_turn(columns.turn[0]):
                     remark = "check sign and unit, and leave it out if it is an estimate from the same readings"

@@ -101,9 +101,8 @@ def ingest_reads(job: Job, unit: str, settings: Settings) -> str | None:
 
 def _ingested(files: UnitFiles, settings: Settings) -> list[Recording]:
     procedure, recordings = settings.procedure, []
-    whole = files.recordings or read_recordings(
-        procedure, settings.ingest, settings.sensor, files.folder, files.in_memory
-    )
+    place = files.folder, files.in_memory
+    whole = files.recordings or read_recordings(procedure, settings.ingest, settings.sensor, *place)
     held_out = any(read.role == "validation" for read in whole)
     for read in whole:
         entry = procedure.recordings.get(read.name)

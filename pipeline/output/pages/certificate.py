@@ -105,9 +105,8 @@ def certificate(
             "command": run_command(settings.stated.run) if settings.stated.run else None,
         },
     }
-    missing = [
-        {"what": w, "clause": clause, "key": key} for w, clause, key, value in _wanted(document, stated) if not value
-    ]
+    wanted = _wanted(document, stated)
+    missing = [{"what": w, "clause": clause, "key": key} for w, clause, key, value in wanted if not value]
     stamp = STAMP + ", ".join(m["what"] for m in missing) if missing else None
     return {"complete": not missing, "stamp": stamp, "missing": missing, **document}
 

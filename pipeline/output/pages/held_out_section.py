@@ -160,9 +160,8 @@ def _steps_if_added(found: JSON, reached: float | None, factor: float) -> list[P
     words, exact = "if added with the suggested shape" if found.get("suggested_effect") else "if added", _exact(found)
     words += "" if exact else ", about"
     digits = 3 if exact else 1
-    return [
-        Point(f"+ {plain(r['effect'])}, {words}", r["held_out_error_after"] / factor, 4, digits=digits) for r in chosen
-    ]
+    after = [(f"+ {plain(r['effect'])}, {words}", r["held_out_error_after"] / factor) for r in chosen]
+    return [Point(name, value, 4, digits=digits) for name, value in after]
 
 
 def _exact(found: JSON) -> bool:
@@ -253,10 +252,8 @@ def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON |
     for axis, part in axes.items():
         curve, colour = {k: np.array(v) for k, v in part["allan"].items()}, AXES.index(axis)
         layers += [Area(curve["low"], curve["high"], colour, curve["tau_s"])] if part["allan"]["low"] else []
-        layers += [
-            LineMark(curve["tau_s"], curve["fit"], colour, "model"),
-            Dots(curve["tau_s"], curve["deviation"], colour),
-        ]
+        at, deviation = curve["tau_s"], curve["deviation"]
+        layers += [LineMark(at, curve["fit"], colour, "model"), Dots(at, deviation, colour)]
     legend, tau = list(AXES_LEGEND), np.array(next(iter(axes.values()))["allan"]["tau_s"])
     if density:
         legend.append(("c3", "sensor file"))

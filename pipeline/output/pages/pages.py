@@ -165,9 +165,8 @@ def budget_section(budget: JSON) -> Markup:
 def heading(name: str) -> Markup:
     """Return a cell of a table's head; "#" before its name aligns the column as numbers."""
     of_numbers = Markup(' class="n"') if name.startswith("#") else ""
-    return (
-        Markup('<th scope="col"{}>{}</th>').format(of_numbers, name.removeprefix("#")) if name else Markup("<td></td>")
-    )
+    head = Markup('<th scope="col"{}>{}</th>').format(of_numbers, name.removeprefix("#"))
+    return head if name else Markup("<td></td>")
 
 
 def _figure(value: object, scale: Scale | None = None) -> str:

@@ -229,9 +229,8 @@ def summary_row(
 
 def sheet_columns(row: JSON) -> dict[str, str]:
     """Return the values of a row that are from ``units.csv``."""
-    return {
-        k: v for k, v in row.items() if v is not None and (k in ("serial", "lot", "date") or k not in SUMMARY_COLUMNS)
-    }
+    own = {"serial", "lot", "date"}
+    return {k: v for k, v in row.items() if v is not None and (k in own or k not in SUMMARY_COLUMNS)}
 
 
 def unit_parameters(calibration: JSON, sensor_model: Sensor) -> list[tuple[Any, ...]]:

@@ -408,9 +408,8 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
     )
     figure = Figure(f"{sensor}-ranking", finding, caption)
     label = "ΔBIC (linear to ±10, logarithmic beyond)"
-    return bars(
-        figure, rows, label, levels={f"threshold {MIN_DELTA_BIC:g}": MIN_DELTA_BIC}, kind="symlog", brackets=brackets
-    )
+    levels = {f"threshold {MIN_DELTA_BIC:g}": MIN_DELTA_BIC}
+    return bars(figure, rows, label, levels=levels, kind="symlog", brackets=brackets)
 
 
 def _evidence(entry: JSON) -> float:

@@ -219,10 +219,8 @@ def use_rows(part: JSON, noise: JSON | None) -> list[JSON]:
             sizes = [(each or {}).get("value") or (each or {}).get("upper_limit") for each in found]
             scale = scale_of(unit, *sizes)
             limits = ["" if (each or {}).get("value") else "< " for each in found]
-            texts = [f"{s}{number(v / scale.factor)}" if v else NOTHING for s, v in zip(limits, sizes, strict=True)] + [
-                ""
-            ]
-            rows.append({"name": f"noise {symbol}", "key": symbol, "texts": texts, "unit": scale.unit})
+            texts = [f"{s}{number(v / scale.factor)}" if v else NOTHING for s, v in zip(limits, sizes, strict=True)]
+            rows.append({"name": f"noise {symbol}", "key": symbol, "texts": [*texts, ""], "unit": scale.unit})
     return rows
 
 
@@ -250,9 +248,8 @@ def rest_rows(part: JSON) -> list[JSON]:
     ``part`` contains them in ``rests``, or in the ``details`` of the stages of a fit.
     """
     found = [part.get("rests") or {}, *(stage.get("details") or {} for stage in part.get("stages") or [])]
-    rows = [
-        {**r, "use": use} for rests in found for use in USES for r in rests.get(f"rests_{use.replace(' ', '_')}") or []
-    ]
+    keys = {use: f"rests_{use.replace(' ', '_')}" for use in USES}
+    rows = [{**r, "use": use} for rests in found for use, key in keys.items() for r in rests.get(key) or []]
     return sorted(rows, key=lambda row: (row["recording"], row["time_s"]))
 
 

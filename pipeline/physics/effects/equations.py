@@ -344,9 +344,8 @@ class LowPassLag(_Timing):
         if values[0] <= DIFFERENCE_STEP_S:
             slope = -truth_rate(sensor, motion)
         else:
-            later, sooner = (
-                truth(sensor, self.moved(motion, values + d)) for d in (DIFFERENCE_STEP_S, -DIFFERENCE_STEP_S)
-            )
+            moved = (self.moved(motion, values + d) for d in (DIFFERENCE_STEP_S, -DIFFERENCE_STEP_S))
+            later, sooner = (truth(sensor, at) for at in moved)
             slope = (later - sooner) / (2.0 * DIFFERENCE_STEP_S)
         return np.asarray(slope @ K.T)[:, :, None]
 

@@ -112,9 +112,8 @@ class FormulaEffect(DeclaredEffect):
             self.layout = Layout.PER_AXIS if any(t.by_axis for t in terms) else Layout.EVERY_AXIS
         varies = " and ".join(n for n in self._names if n != "u") or "what the sensor measures"
         self.excitation = self.excitation or f"recordings in which {varies} changes, on every axis concerned"
-        self.experiment = (
-            self.experiment or f"repeat the recordings at other values of {varies}, with all else as it was"
-        )
+        repeated = f"repeat the recordings at other values of {varies}, with all else as it was"
+        self.experiment = self.experiment or repeated
 
     def fields(self, sensor: str, values: Values) -> set[str]:
         """Return the fields of ``Motion`` that the formulas name."""

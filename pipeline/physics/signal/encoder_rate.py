@@ -170,9 +170,8 @@ def _smoothed(time: Values, angle: Values, step: float, error: float) -> Encoder
     for first, last in itertools.chain.from_iterable(map(itertools.pairwise, ends)):
         before, after = first in apart, last in apart
         around = slice(first if before else max(first - ADDED_REST, 0), last if after else min(last + ADDED_REST, n))
-        vague[first : first + ADDED_REST * before] = vague[max(last - ADDED_REST * after, first) : last] = (
-            before or after
-        )
+        ending = max(last - ADDED_REST * after, first)
+        vague[first : first + ADDED_REST * before] = vague[ending:last] = before or after
         part, span = slice(first - around.start, last - around.start), slice(first, last)
         if around.stop - around.start <= 2 * ADDED_REST:
             rate[span], noise[span] = np.gradient(angle[around], time[around])[part], np.sqrt(0.5) * error / interval
@@ -242,9 +241,8 @@ class _Smoother:
         weight = self.apart * np.exp(-log_density)
         difference = sum(self.rows[j] * smooth[j : len(smooth) - self.order + j] for j in range(self.order + 1))
         log_determinant = 2.0 * np.log(factor[-1]).sum() - np.log(weight * self.rows[-1] ** 2).sum()
-        return float(
-            log_determinant + np.sum((self.angle - smooth) ** 2) / self.variance + np.sum(weight * difference**2)
-        )
+        misfit = np.sum((self.angle - smooth) ** 2) / self.variance
+        return float(log_determinant + misfit + np.sum(weight * difference**2))
 
 
 class Pieces(NamedTuple):
@@ -372,9 +370,8 @@ class EncoderTrajectory:
     def _interval(self, time: Values) -> Index:
         """Return the interval of each time: computed where the samples are equidistant, else searched."""
         last = len(self._step) - 1
-        k: Index = np.clip((time - self.time[0]) * ((last + 1) / (self.time[-1] - self.time[0])), 0, last).astype(
-            np.intp
-        )
+        steps = (time - self.time[0]) * ((last + 1) / (self.time[-1] - self.time[0]))
+        k: Index = np.clip(steps, 0, last).astype(np.intp)
         lost = ((time < self.time[k]) & (k > 0)) | ((time >= self.time[k + 1]) & (k < last))
         k[lost] = np.clip(np.searchsorted(self.time, time[lost], side="right") - 1, 0, last)
         return k
