@@ -71,10 +71,8 @@ def check_static(recordings: Sequence[Recording], settings: Settings) -> list[Re
     if all(r.role != "static" for r in recordings):
         return list(recordings)
     sensor_model, rests = settings.sensor, _rests_of(recordings)
-    return [
-        _doubted(_resting(r, rests, sensor_model), recordings, rests, sensor_model) if r.role == "static" else r
-        for r in recordings
-    ]
+    resting = [_resting(r, rests, sensor_model) if r.role == "static" else r for r in recordings]
+    return [_doubted(r, recordings, rests, sensor_model) if r.role == "static" else r for r in resting]
 
 
 def with_rates_at_rest(recordings: Sequence[Recording]) -> list[Recording]:

@@ -185,9 +185,8 @@ def _columns_of(name: str, turn: _Conventional) -> Values:
     rest = motion_at_rest(QUARTERS_DEG)
     motion = replace(rest, specific_force=force, level=level, axis=turn.axis, angle=QUARTERS_DEG, rate=np.zeros(4))
     of = effect(name)
-    at_0, at_90, at_180, at_270 = of.regressors(
-        "accelerometer", motion, np.eye(3), np.zeros(len(of.parameters("accelerometer")))
-    )
+    values = np.zeros(len(of.parameters("accelerometer")))
+    at_0, at_90, at_180, at_270 = of.regressors("accelerometer", motion, np.eye(3), values)
     return np.stack([(at_0 + at_90 + at_180 + at_270) / 4.0, (at_0 - at_180) / 2.0, (at_90 - at_270) / 2.0])
 
 

@@ -296,10 +296,8 @@ def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]
     low, high = np.zeros(len(sizes)), np.maximum.reduceat(mean + 5.0 * deviation, first)
     x = np.minimum(2.0 * np.sqrt(total(mean**2 + deviation**2) / whole), high)
     for _ in range(QUANTILE_ITERATIONS):  # a step of Newton's method, or a halving if the step leaves the interval
-        upper, lower = (
-            np.clip((x[of] + side * mean) / deviation, -MAX_NORMAL_DEVIATIONS, MAX_NORMAL_DEVIATIONS)
-            for side in (-1.0, 1.0)
-        )
+        sides = ((x[of] + side * mean) / deviation for side in (-1.0, 1.0))
+        upper, lower = (np.clip(side, -MAX_NORMAL_DEVIATIONS, MAX_NORMAL_DEVIATIONS) for side in sides)
         excess = total(scipy.special.ndtr(upper) - scipy.special.ndtr(-lower)) - UPPER_LIMIT_SHARE * whole
         density = total((np.exp(-0.5 * upper**2) + np.exp(-0.5 * lower**2)) / deviation) / np.sqrt(2.0 * np.pi)
         low, high = np.where(excess < 0.0, x, low), np.where(excess < 0.0, high, x)
@@ -438,10 +436,8 @@ def _products(
     the products are those of the selection's ranking. ``known``: number of columns of the base.
     """
     ranking = selection.ranking
-    places = {
-        (term.effect.name, term.values.tobytes()): at
-        for term, at in zip(ranking.candidates, ranking.slices, strict=False)
-    }
+    candidates = zip(ranking.candidates, ranking.slices, strict=False)
+    places = {(term.effect.name, term.values.tobytes()): at for term, at in candidates}
     keys = [(name, term.values.tobytes()) for name, term, _ in listed]
     if fit.terms or any(key not in places for key in keys):
         configured = fit.terms[: len(selection.base.terms)]

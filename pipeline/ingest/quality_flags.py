@@ -473,9 +473,8 @@ def misfits_deg(moves: Sequence[MoveByHand], scales: Sequence[float]) -> Values:
         angle = np.linalg.norm(vector, axis=2, keepdims=True)
         axis = vector / np.maximum(angle, 1e-12)
         along = np.sum(axis * direction, axis=2, keepdims=True)
-        direction = (
-            direction * np.cos(angle) + np.cross(axis, direction) * np.sin(angle) + axis * along * (1 - np.cos(angle))
-        )
+        cos, sin = np.cos(angle), np.sin(angle)
+        direction = direction * cos + np.cross(axis, direction) * sin + axis * along * (1 - cos)
     after = np.stack([m.after for m in moves])[:, None, :]
     return np.asarray(np.degrees(np.arccos(np.clip(np.sum(direction * after, axis=2), -1.0, 1.0))))
 

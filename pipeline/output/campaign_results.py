@@ -139,10 +139,8 @@ class CampaignResults:
         Columns: ``unit, sensor, verdict, residual_over_noise`` (rms residual of the fit of the diagnosis, divided by
         the noise), ``selected`` (missing effects, joined by ";"), ``reason, next_experiment, override`` (text).
         """
-        rows = (
-            {**part, **about, "selected": ";".join(part.get("selected") or [])}
-            for about, part in self._parts("diagnosis")
-        )
+        parts = self._parts("diagnosis")
+        rows = ({**part, **about, "selected": ";".join(part.get("selected") or [])} for about, part in parts)
         return pd.DataFrame(rows, columns=["unit", "sensor", *DIAGNOSIS])
 
     @cached_property
@@ -211,9 +209,8 @@ class CampaignResults:
             folder, *others = DOCUMENT_FOLDERS
             calibration = self._document(folder, name)
             ok = calibration["status"] == "ok"
-            self._documents[name] = UnitResults(
-                name, calibration, *(self._document(folder, name) if ok else None for folder in others)
-            )
+            found = (self._document(folder, name) if ok else None for folder in others)
+            self._documents[name] = UnitResults(name, calibration, *found)
         return self._documents[name]
 
     def _document(self, folder: str, name: str) -> JSON:

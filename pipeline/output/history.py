@@ -224,10 +224,8 @@ def _changed_recordings(before: JSON, after: JSON) -> list[str]:
 
 def _changed_values(before: JSON, after: JSON) -> list[str]:
     """Return the values of the configuration that differ, except effects, each as ``key: before -> after``."""
-    old, new = (
-        {f"{s}.{k}": v for s, part in (state.get(VALUES) or {}).items() for k, v in part.items()}
-        for state in (before, after)
-    )
+    values = ((state.get(VALUES) or {}).items() for state in (before, after))
+    old, new = ({f"{s}.{k}": v for s, part in each for k, v in part.items()} for each in values)
     keys = [k for k in dict.fromkeys([*old, *new]) if old.get(k) != new.get(k)] if old and new else []
     keys = [k for k in keys if not k.startswith("effects.")]
     defined = [k for k in keys if k.startswith("user_effects.") and not (k in old and k in new)]  # effects, too

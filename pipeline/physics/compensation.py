@@ -358,9 +358,8 @@ class CompensationStream:
                 ends.append(self._ends[min(number, len(self._ends) - 1)].after(motion, past))
             return motion
 
-        truths = measurement.solve(
-            {s: self._moving[s] if s in turns else self._linear[s] for s in steps}, readings, motion_of
-        )
+        steps_of = {s: self._moving[s] if s in turns else self._linear[s] for s in steps}
+        truths = measurement.solve(steps_of, readings, motion_of)
         settled = len(ends)
         for iteration in range(settled, max(settled + 1, len(self._ends)) if turns and past else settled):
             motion_of(truths, iteration)

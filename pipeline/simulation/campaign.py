@@ -220,9 +220,8 @@ def _scene(plan: Planned, bench: SimulatedBench, start: float, rng: np.random.Ge
     up = rotation_by(np.append(np.asarray(settings.get("tilt_deg", (0.0, 0.0)), float), 0.0))[2]
     earth = earth_of(table)
     mounting = rotation_by(np.asarray(settings.get("mounting_deg", {}).get(plan.name, np.zeros(3)), float))
-    return Scene(
-        trajectory, start, plan.axis, table.gravity_g, up, np.zeros(3) if earth is None else earth, mounting=mounting
-    )
+    turning = np.zeros(3) if earth is None else earth
+    return Scene(trajectory, start, plan.axis, table.gravity_g, up, turning, mounting=mounting)
 
 
 def _log(plan: Planned, bench: SimulatedBench, time: Values) -> dict[str, Any]:

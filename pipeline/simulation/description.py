@@ -184,10 +184,8 @@ def fit_to_samples(procedure: str, course: Course, samples: int, interval: float
     target = samples * interval
 
     def stretched(step: float, factor: float) -> Course:
-        stretch = {
-            name: factor * getattr(course, name)
-            for name in ("dwell_s", "rest_s", "warm_up_rest_s", "validation_s", "static_s", "soak_s")
-        }
+        names = ("dwell_s", "rest_s", "warm_up_rest_s", "validation_s", "static_s", "soak_s")
+        stretch = {name: factor * getattr(course, name) for name in names}
         return replace(course, step_deg=step, **stretch)
 
     def length(candidate: Course) -> float:

@@ -99,10 +99,8 @@ class Scene:
             nodes, weights = LAG_RULE
             past = [self._without_lag(shown - self.lag * node, None) for node in nodes]
             names = ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate")
-            motion = replace(
-                motion,
-                **{name: sum(w * getattr(p, name) for w, p in zip(weights, past, strict=True)) for name in names},
-            )
+            weighted = [*zip(weights, past, strict=True)]
+            motion = replace(motion, **{name: sum(w * getattr(p, name) for w, p in weighted) for name in names})
         return replace(motion, time=time, at_offset=lambda offset=0.0: self.motion(time + offset, temperature))
 
     def _without_lag(self, time: Values, temperature: Values | None) -> Motion:

@@ -339,10 +339,8 @@ def changed_files(unit: str, before: ExportedUnit | None, after: ExportedUnit | 
     if before is None or after is None:
         return []
     was, files = before.held_out_errors(less=False), dict[str, list[str]]()
-    best = [
-        {s: min(e for (x, _), e in errors.items() if x == s) for s, _ in errors}
-        for errors in (was, after.held_out_errors(less=False))
-    ]
+    both = was, after.held_out_errors(less=False)
+    best = [{s: min(e for (x, _), e in errors.items() if x == s) for s, _ in errors} for errors in both]
     for (sensor, file), now in after.held_out_errors(less=True).items():
         error = was.get((sensor, file))
         if not error:

@@ -68,9 +68,8 @@ def main(argv: Sequence[str]) -> int:
     if sheet and not (folder / sheet).exists():
         (folder / sheet).write_text(EXAMPLE, encoding="utf-8")
     (arguments.directory / "README.md").write_text(text, encoding="utf-8")
-    (arguments.directory / "campaign.yaml").write_text(
-        _campaign(procedure_name, sensor_name, data_sheets, ranges), encoding="utf-8"
-    )
+    text = _campaign(procedure_name, sensor_name, data_sheets, ranges)
+    (arguments.directory / "campaign.yaml").write_text(text, encoding="utf-8")
     row = f"{arguments.unit},,,,{sensor_name},{table_name},{procedure_name},"
     units_table.write_text(f"{HEADER}\n{row}\n", encoding="utf-8")
     print(f"{units_table}: one row for each unit; put the recordings into {folder}")

@@ -84,10 +84,8 @@ class Composer:
         for file in files:  # checks each file before Hydra opens it
             mapping_of(file)
         self.state = tuple((status.st_mtime_ns, status.st_size) for status in map(Path.stat, files))
-        self.options = {
-            group: {f.stem for root in (CONFIGS, *self.searchpath) for f in (root / group).glob("*.yaml")}
-            for group in GROUPS
-        }
+        roots = CONFIGS, *self.searchpath
+        self.options = {group: {f.stem for root in roots for f in (root / group).glob("*.yaml")} for group in GROUPS}
         self.user_effects: UserEffects = load_user_effects(campaign, [*self.searchpath, CONFIGS], python_effects)
         self.effects = {f.stem for f in (CONFIGS / "effect").glob("*.yaml")} | set(self.user_effects.effects)
         self._bases: dict[Groups, tuple[dict[str, Any], bool]] = {}

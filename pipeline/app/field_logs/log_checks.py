@@ -230,9 +230,8 @@ class LogChecks:
             change = np.linalg.norm(compensated, axis=1) - np.linalg.norm(raw, axis=1)
             enough = len(_directions(raw)) >= FEWEST_RESTS and np.sqrt(np.mean(change**2)) > after / 2.0
             unit = "g from 1 g" if sensor == "accelerometer" else "deg/s from zero"
-            if (sensor == "gyroscope" or enough) and after > max(
-                WORSE_FACTORS[sensor] * before, SIGNIFICANT_ERRORS * standard_error
-            ):
+            usual = max(WORSE_FACTORS[sensor] * before, SIGNIFICANT_ERRORS * standard_error)
+            if (sensor == "gyroscope" or enough) and after > usual:
                 worse.append(f"the {sensor} is {before:.2g} {unit} before and {after:.2g} after")
             least = float(np.min(_distances(sensor, compensated)))
             if least > CHANGED[sensor]:

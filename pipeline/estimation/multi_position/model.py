@@ -230,9 +230,8 @@ def stacked(blocks: Sequence[EquationBlock], model: Model, state: State, candida
     """
     sizes = [len(block.residual) for block in blocks]
     edges = np.cumsum([0, *sizes])
-    start, length, recording = (
-        np.concatenate(times) for times in zip(*(b.stretches for b in blocks if b.stretches is not None), strict=True)
-    )
+    stretches = (b.stretches for b in blocks if b.stretches is not None)
+    start, length, recording = (np.concatenate(times) for times in zip(*stretches, strict=True))
     scatter = np.zeros((model.kinds, edges[-1]))
     bias, column = np.zeros((3, edges[-1], len(start))), 0
     for kind, (block, rows) in enumerate(zip(blocks, map(slice, edges[:-1], edges[1:]), strict=True)):

@@ -80,10 +80,8 @@ def findings(case: DiagnosisInput) -> Findings:
     verdict = verdict_of_selection_by_hand(selection.names, unknown, left_over)
     scores = fitting.log_likelihoods(selection.fits[-1].equations, selection.hypotheses)
     best = selection.hypotheses[int(np.argmax(scores))]
-    signal, folds = (
-        selection.first.signal,
-        _folds(selection, lambda part: SelectionByHand(part, *given, fitting.COMPARED_STEP)),
-    )
+    signal = selection.first.signal
+    folds = _folds(selection, lambda part: SelectionByHand(part, *given, fitting.COMPARED_STEP))
 
     held_out = _held_out(selection, folds)
 

@@ -213,9 +213,8 @@ def _read(file: Path, format_name: str, declared: Format, content: Node, counts:
     sensors = _sensors_in(file, declared, content)
     if not sensors:
         names = [f"a name that ends in {e}{Path(declared.file).suffix}" for e in declared.sensor_endings.values()]
-        wanted = " or ".join(names) or ", ".join(
-            str(declared.read_back[s]["where"]) for s in SENSORS if s in declared.read_back
-        )
+        places = (str(declared.read_back[s]["where"]) for s in SENSORS if s in declared.read_back)
+        wanted = " or ".join(names) or ", ".join(places)
         raise InputError(f"this is no {format_name} ({declared.consumer}): expected {wanted}", str(file))
     per_unit = {s: counts.get(s) for s in SENSORS}
     lacking = [s for s in declared.required_counts if s in sensors and not per_unit[s]]
@@ -323,10 +322,8 @@ def _part(calibration: SensorCalibration) -> JSON:
         return found.tolist()
 
     for key in ("standard_uncertainty", "expanded_uncertainty"):
-        part[key] = {
-            "bias": where(known[BIAS], part[key]["bias"]),
-            "matrix": where(known[MATRIX].reshape(3, 3), part[key]["matrix"]),
-        }
+        bias, matrix = part[key]["bias"], part[key]["matrix"]
+        part[key] = {"bias": where(known[BIAS], bias), "matrix": where(known[MATRIX].reshape(3, 3), matrix)}
     part["covariance"]["values"] = where(np.outer(known, known), part["covariance"]["values"])
     return part
 
@@ -389,9 +386,8 @@ def lost(imported: ImportedCalibration, format_name: str, file: Path, unit: Expo
         if s not in back.sensors:
             lines.append(f"{s}: all of it; {format_name} holds no {s}")
             continue
-        told = _differences(
-            calibration, back.sensors[s], all_effects=declared.effects == ["all"], fitted=exported[s].held is not None
-        )
+        every, fitted = declared.effects == ["all"], exported[s].held is not None
+        told = _differences(calibration, back.sensors[s], all_effects=every, fitted=fitted)
         lines += [f"{s}: {line}" for line in (*told, *exported[s].left_by_matrix(declared.matrix.get(s, "full")))]
     if imported.noise and not back.noise:
         lines.append("the noise densities and random walks")
@@ -409,9 +405,8 @@ def _differences(before: SensorCalibration, after: SensorCalibration, *, all_eff
     lines = []
     if bias > CONVERSION_TOLERANCE:
         left_out = np.any(before.bias) and not np.any(after.bias)
-        lines.append(
-            "the bias" if left_out else f"the bias {'changes' if fitted else 'is rounded,'} by up to {bias:.2g} {unit}"
-        )
+        by = "" if left_out else f" {'changes' if fitted else 'is rounded,'} by up to {bias:.2g} {unit}"
+        lines.append(f"the bias{by}")
     if matrix > CONVERSION_TOLERANCE:
         lines.append(f"elements of the matrix change by up to {matrix:.2g}")
     values = {e.name: e.values for e in after.effects}

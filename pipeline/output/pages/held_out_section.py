@@ -70,10 +70,8 @@ def over_temperature(calibration: SensorCalibration, recordings: list[Recording]
             force = np.tile(rests.reading.mean(axis=0) * (sensor == "accelerometer"), (len(rests.time), 1))
             model = predicted_reading(calibration, motion_at_rests(rests, force))
             change, predicted = (values - values.mean(axis=0) for values in (rests.reading, model))
-            found += [
-                np.column_stack([rests.temperature, rests.temperature_rate, change, predicted]),
-                np.full((1, 8), np.nan),
-            ]
+            of_rests = np.column_stack([rests.temperature, rests.temperature_rate, change, predicted])
+            found += [of_rests, np.full((1, 8), np.nan)]
     if not found:
         return None
     warmth, warming, *columns = np.concatenate(found).T  # lines end at the rows of NaN
@@ -212,9 +210,8 @@ def held_out_over_time(
         Panel([Area(-2 * floor, 2 * floor), *after] if floor else after, f"after, {unit}", 80),
     ]
     rms = [float(np.sqrt(np.nanmean(v**2))) for v in (raw, calibrated)]
-    finding, caption, description = sentences(
-        "held_out", name=recording.name, sensor=sensor, rms=rms, unit=unit, by_hand=by_hand
-    )
+    about = {"name": recording.name, "sensor": sensor, "rms": rms, "unit": unit, "by_hand": by_hand}
+    finding, caption, description = sentences("held_out", **about)
     return chart(Figure(name, finding, caption, BEFORE_AFTER), description, panels, "time, s")
 
 
