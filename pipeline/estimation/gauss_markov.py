@@ -387,10 +387,9 @@ class Products:
 
     def __init__(self, blocks: Blocks, weight: Values, columns: Values) -> None:
         self.blocks, self.weight, self.columns = blocks, weight, columns
-        root = np.sqrt(weight)[:, None]
-        rooted = root * columns
-        self.white: Values = rooted.T @ rooted  # of one array: numpy computes half of it
-        self.means = blocks.sums(np.multiply(root, rooted, out=rooted)) / blocks.weight[:, None]
+        weighted = weight[:, None] * columns
+        self.white: Values = columns.T @ weighted  # with roots, rounding exceeds what collinear columns leave
+        self.means = blocks.sums(weighted) / blocks.weight[:, None]
 
     def products(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
         """Return ``A^T C^-1 A``, (g, p, p), and ``log det C`` of one channel, (g,), up to that of the weights."""

@@ -115,6 +115,11 @@ def test_nothing_is_found_where_nothing_is_hidden(family: str) -> None:
     assert all(max(entry["gains"].values()) < MIN_DELTA_BIC for entry in found)
 
 
+def test_three_effects_leave_no_rounding_that_looks_like_a_curve_of_the_temperature() -> None:
+    found = said(draw("triples", 2, 4203))
+    assert (found.verdict, {*found.selected}) == ("missing_effect", {*found.hidden})
+
+
 @pytest.mark.parametrize("number", range(2))
 def test_what_cannot_be_seen_is_said_to_be_so(number: int) -> None:
     case = draw("unseen", number, SEED)
