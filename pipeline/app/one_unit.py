@@ -40,8 +40,9 @@ from pipeline.core.pack import as_bytes
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Recording, Values, in_body_axes, maps_of_log
 from pipeline.core.settings import Settings, UserEffectFiles
 from pipeline.core.verdicts import error_of
-from pipeline.ingest.files import SHEET, candidate_files, sheet_of_mapping, with_sheet, wrong_name
+from pipeline.ingest.files import candidate_files, wrong_name
 from pipeline.ingest.read import IN_MEMORY, of_one_sensor, tried
+from pipeline.ingest.recordings_sheet import SHEET, sheet_of_mapping, with_sheet
 from pipeline.output.outcome import run_command
 from pipeline.physics.compensation import Compensation, compensation_of
 from pipeline.physics.effects import registered

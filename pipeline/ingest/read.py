@@ -51,8 +51,9 @@ from pipeline.core.records import (
 from pipeline.core.settings import Ingest, Procedure, RecordingFile, Sensor
 from pipeline.ingest.clock_alignment import unwrapped
 from pipeline.ingest.disturbances import leave_out_disturbances, leave_out_shaken_rests
-from pipeline.ingest.files import candidate_files, require_recordings
+from pipeline.ingest.files import candidate_files
 from pipeline.ingest.quality_flags import examine, without_gaps
+from pipeline.ingest.recordings_sheet import require_recordings
 
 MAX_NAMED_FILES = 5  # further files that an error lists
 LEAST_TURN_OF_ROWS = 0.01  # rad: rows of attitudes differ by more, samples of a rest or of movement by less

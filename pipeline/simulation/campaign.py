@@ -43,7 +43,7 @@ from pipeline.core.records import AXES, SENSORS, Recording, Values, continuous
 from pipeline.core.settings import ProgramRest, ProgramTurn, Repeated, Sensor, Table
 from pipeline.ingest.arrow import write_recording
 from pipeline.ingest.clock_alignment import Program
-from pipeline.ingest.files import COLUMNS, SHEET
+from pipeline.ingest.recordings_sheet import COLUMNS, SHEET
 from pipeline.physics.kinematics import earth_of
 from pipeline.simulation.description import (
     BY_FILE,

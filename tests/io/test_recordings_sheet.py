@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from pipeline.core.errors import IngestError, MissingInputError
-from pipeline.ingest.files import direction_of, read_sheet
+from pipeline.ingest.recordings_sheet import direction_of, read_sheet
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,7 +13,7 @@ from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.files import CONFIGS
 from pipeline.core.records import SENSOR_UNITS, SENSORS
 from pipeline.core.settings import DataSheet, Table, settings_of_ranges
-from pipeline.ingest.files import EXAMPLE
+from pipeline.ingest.recordings_sheet import EXAMPLE
 from pipeline.output.outcome import run_command
 from pipeline.output.pages.pages import template
 from pipeline.simulation.description import TABLE_PROCEDURES, UnitDescription, described, read_option, shipped_settings

@@ -60,7 +60,8 @@ from pipeline.core.settings import (
     without_overridden,
 )
 from pipeline.estimation.stages import NOT_WANTED, check_stages, declared
-from pipeline.ingest.files import candidate_files, with_sheet
+from pipeline.ingest.files import candidate_files
+from pipeline.ingest.recordings_sheet import with_sheet
 
 Groups: TypeAlias = tuple[tuple[str, str], ...]  # group and option
 INSTANCE = "${ingest.instance}"

@@ -38,7 +38,7 @@ from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
 from pipeline.evaluation.diagnosis.multi_position import require_model
-from pipeline.ingest.files import recordings_of_text
+from pipeline.ingest.recordings_sheet import recordings_of_text
 from pipeline.output.pages.pages import template
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import Owner, unit_of

@@ -102,7 +102,7 @@ class Recording:
     filter: dict[str, Any] = field(default_factory=lambda: {"name": "none", "delay_s": 0.0, "noise_gain": 1.0})
     clock_shared: bool = True  # whether the time between this recording and the unit's others is known
     setup: str = ""  # table, mounting or session of the recording; empty if the unit has only one
-    kind: str = ""  # in the sheet of the recordings (``pipeline.ingest.files``); empty without one
+    kind: str = ""  # in the sheet of the recordings (``pipeline.ingest.recordings_sheet``); empty without
     # Body axis (+x, -z ..) that points up during a turn about a vertical axis; empty for other turns, where it follows
     # from the table's angle.
     up: str = ""
