@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.__main__ import main
-from pipeline.app.commands import guide
+from pipeline.app.commands import guide_recording
 from pipeline.core.files import CONFIGS
 from pipeline.core.records import Recording
 from pipeline.core.settings import HandTurns
@@ -93,7 +93,7 @@ def test_a_growing_log_is_followed_until_it_is_enough(
     def grow(_: float) -> None:
         log.write_bytes(data[: next(sizes)])
 
-    monkeypatch.setattr(guide.time, "sleep", grow)
+    monkeypatch.setattr(guide_recording.time, "sleep", grow)
     assert main(["guide", str(log), "--sensor", "mpu6050", "--goal", "0.8", "--follow"]) == 0
     out = capsys.readouterr().out
     lines = out.splitlines()
@@ -116,7 +116,7 @@ def test_a_rest_that_is_left_out_is_told_once_and_hides_no_later_one(
     table[leans, 1] += np.linspace(-0.1, 0.1, np.count_nonzero(leans))
     lines = lines_of(header, table)
     log, sizes = tmp_path / "log.csv", iter(range(100, len(lines), 60))
-    monkeypatch.setattr(guide.time, "sleep", lambda _: log.write_text("\n".join(lines[: next(sizes)]) + "\n"))
+    monkeypatch.setattr(guide_recording.time, "sleep", lambda _: log.write_text("\n".join(lines[: next(sizes)]) + "\n"))
     assert main(["guide", str(log), "--sensor", "mpu6050", "--goal", "0.9", "--follow"]) == 0
     told = capsys.readouterr().out.splitlines()
     left_out = [line for line in told if "left out" in line]
@@ -143,7 +143,7 @@ def test_the_rests_as_last_told_are_those_that_each_message_counts(
             raise KeyboardInterrupt
         (tmp_path / "log.csv").write_text("\n".join(lines[: 1 + int(np.sum(since < until))]) + "\n")
 
-    monkeypatch.setattr(guide.time, "sleep", grow)
+    monkeypatch.setattr(guide_recording.time, "sleep", grow)
     options = ["--sensor", "mpu6050", "--goal", "0.001", "--dwell", "2", "--follow"]
     assert main(["guide", str(tmp_path / "log.csv"), *options]) == 0
     lines = capsys.readouterr().out.splitlines()
