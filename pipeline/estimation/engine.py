@@ -365,7 +365,8 @@ def noise_outside_known_errors(  # noqa: PLR0917  (what a restricted likelihood 
     X = U[:, s > AVERAGED_OUT * s[0]]
     errors = disturbance / scale[:, None]
     errors -= X @ (X.T @ errors)
-    directions, sizes, _ = np.linalg.svd(errors, full_matrices=False)
+    # QR iterations: the faster method of numpy did not converge for one in 5,600 units of the blind study
+    directions, sizes, _ = scipy.linalg.svd(errors, full_matrices=False, lapack_driver="gesvd")
     known = min(int(np.sum(sizes > 1.0)), len(scale) - X.shape[1] - 1)  # at least one direction is used
     X = np.column_stack([X, directions[:, :known]])
     y = (root * (means / white).T).ravel()
