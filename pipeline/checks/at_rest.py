@@ -223,8 +223,12 @@ def _moving(recording: Recording, sensor: str, blocks: Values, sheet: DataSheet,
 def _slow(data_sheet: DataSheet, change: float, duration: float) -> float:
     """Return the largest plausible change of a bias at rest, for a change of temperature (degC) and a duration (s)."""
     effects = data_sheet.effects
-    wander = SIGNIFICANT_DEVIATIONS_AT_REST * data_sheet.bias_wander + effects.get("bias_drift", 0.0) * duration
-    return wander + effects.get("bias_temperature", 0.0) * change + effects.get("warm_up", 0.0)
+    return (
+        SIGNIFICANT_DEVIATIONS_AT_REST * data_sheet.bias_wander
+        + effects.get("bias_drift", 0.0) * duration
+        + effects.get("bias_temperature", 0.0) * change
+        + effects.get("warm_up", 0.0)
+    )
 
 
 def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
@@ -333,10 +337,12 @@ def _check_spans(recording: Recording) -> None:
             which = "the rows in which the table turns"
             stuck += [(TRIADS["accelerometer"][i], spans[i], "1 g", which) for i in across if spans[i] < SPANNED]
     for channel, span, expected, which in stuck:
-        least = f"{span:.3g} {expected.partition(' ')[2]} in nine tenths of {which}"
-        cause = f"while the table's motion about {recording.axis} makes it vary by {expected}"
+        message = (
+            f"{channel} stays within {span:.3g} {expected.partition(' ')[2]} in nine tenths of {which}, while the "
+            f"table's motion about {recording.axis} makes it vary by {expected}"
+        )
         hint = "is the column right, and does this axis of the sensor work?"
-        raise refusal(recording, "stuck", f"{channel} stays within {least}, {cause}", hint)
+        raise refusal(recording, "stuck", message, hint)
 
 
 def _span(values: Values) -> Values:

@@ -221,8 +221,19 @@ def log_motion(
     zeros = np.zeros_like(specific_force)
     rate = _difference(time, specific_force, end.force) if "specific_force_rate" in used else zeros
     turn = _difference(time, angular_rate, end.rate) if "angular_acceleration" in used else zeros
-    signals = (time, specific_force, angular_rate, turn, rate, temperature, None, None, None)
-    motion = Motion(*signals, still=np.zeros(len(time), bool), temperature_rate=temperature_rate)
+    motion = Motion(
+        time=time,
+        specific_force=specific_force,
+        angular_rate=angular_rate,
+        angular_acceleration=turn,
+        specific_force_rate=rate,
+        temperature=temperature,
+        angle=None,
+        rate=None,
+        axis=None,
+        still=np.zeros(len(time), bool),
+        temperature_rate=temperature_rate,
+    )
     if "direction" not in used:
         return motion
     direction = turning_direction(motion)

@@ -89,8 +89,8 @@ class LogChecks:
         cells = [str(cell) for column in columns for cell in column[:CELLS].to_pylist()]
         decimals = [cell.partition(decimal)[2] for cell in cells if "e" not in cell.lower()]
         full = sum(len(text) == DECIMALS for text in decimals)
-        known = len(decimals) >= LEAST_CELLS and full > SHARE * len(decimals)
-        if known and not any(len(text) > DECIMALS or (len(text) == DECIMALS and text[-1] == "0") for text in decimals):
+        often = len(decimals) >= LEAST_CELLS and full > SHARE * len(decimals)
+        if often and not any(len(text) > DECIMALS or (len(text) == DECIMALS and text[-1] == "0") for text in decimals):
             self.compensated = f"the readings have {DECIMALS} decimals, as this command writes them"
 
     def add(

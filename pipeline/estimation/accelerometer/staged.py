@@ -498,9 +498,14 @@ def fit(task: StageInput) -> SensorCalibration:
     cosine, condition = max(each.cosine for each in fits), max(each.condition for each in fits)
     last = name == "scale_factor"
     effects = (fitted_effect(ASYMMETRY, "accelerometer", found.c),) if last else ()
-    convergence, stages = Convergence(cosine, condition, len(theta), len(theta)), (*task.stages, result)
-    calibration = SensorCalibration("accelerometer", found.bias, np.diag(1.0 / found.k), stages, effects)
-    calibration = replace(calibration, convergence=convergence)
+    calibration = SensorCalibration(
+        sensor="accelerometer",
+        bias=found.bias,
+        matrix=np.diag(1.0 / found.k),
+        stages=(*task.stages, result),
+        effects=effects,
+        convergence=Convergence(cosine, condition, len(theta), len(theta)),
+    )
     kept = slice(0, after_c) if last else BASE
     if estimator.as_printed:
         return combined(calibration, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
