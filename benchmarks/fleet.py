@@ -17,6 +17,7 @@ import argparse
 import csv
 import json
 import os
+import re
 import signal
 import statistics
 import subprocess
@@ -28,6 +29,8 @@ from pathlib import Path
 from typing import Any
 
 from imu_research.figures import MeasuredFigure, write_figures
+from pipeline.app.steps.batch import CPU_TIME
+from pipeline.unit import STEPS
 
 PAUSE_S = 15.0, 120.0  # between two measurements of the floor: at first, and in a long run
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,8 +50,9 @@ for unit in sorted(Path(sys.argv[1]).iterdir())[:int(sys.argv[2])]:
 print(time.process_time() - start)
 """
 
-# Every process of the run tells on its way out what it was, and what it has used. The commands that start the jobs do
-# not import this. The largest memory that ``getrusage`` gives may be that of the process from which one was started.
+# Every process of the run tells on its way out what it ran last, and what it has used; the process of a batch runs most
+# of its stages. The commands that start the jobs do not import this. The largest memory that ``getrusage`` gives may be
+# that of the process from which one was started.
 TELL = """
 import atexit, os, resource, sys
 def _tell():
@@ -158,15 +162,23 @@ def _report(folder: Path, cores: int) -> list[MeasuredFigure]:
     spent: dict[str, float] = defaultdict(float)
     jobs: dict[str, int] = defaultdict(int)
     memory: dict[str, float] = defaultdict(float)
+    processes = 0.0
     told = (folder / "told").read_text(encoding="utf-8").splitlines()
     for (_, name), (used_s, kilobytes) in {tuple((w := line.split())[:2]): w[2:] for line in told}.items():
-        spent[name] += float(used_s)
-        jobs[name] += 1
+        processes += float(used_s)
         memory[name] = max(memory[name], float(kilobytes) / 1024)
+        if name not in STEPS:
+            spent[name] += float(used_s)
+            jobs[name] += 1
+    for log in (results / "logs").rglob("*.log"):
+        if found := re.search(rf"^(\w+): ([\d.]+) {CPU_TIME}$", log.read_text(encoding="utf-8"), re.MULTILINE):
+            spent[found[1]] += float(found[2])
+            jobs[found[1]] += 1
     for name, seconds in spent.items():
-        cost = f"{1000 * seconds / units:7.2f} ms a unit {memory[name]:5.0f} MB"
-        print(f"{name:12s} {jobs[name]:5d} processes {cost}")
-    rest = 1000 * (used - sum(spent.values())) / units
+        print(f"{name:12s} {jobs[name]:5d} jobs {1000 * seconds / units:7.2f} ms a unit")
+    start = 1000 * (processes - sum(spent.values())) / units
+    print(f"start and end of the processes of jobs: {start:.2f} ms a unit")
+    rest = 1000 * (used - processes) / units
     print(f"commands that start the jobs, and jobs that were killed: {rest:.2f} ms a unit")
     print(f"all stages, {units} units, {ok} calibrated, in {len(runs)} runs: {1000 * used / units:.0f} ms CPU a unit")
     print(f"{used:.0f} s CPU, {wall:.0f} s on {cores} cores; {files} files, {size / 1e9:.2f} GB of packs")

@@ -47,6 +47,11 @@ class Pack:
     def _archive(self) -> zipfile.ZipFile:
         return cast("zipfile.ZipFile", self._checked(lambda: zipfile.ZipFile(self.path)))
 
+    @cached_property
+    def state(self) -> str:
+        """Digest of names, sizes and checksums of the members."""
+        return directory_of(str(self.path))
+
     def __contains__(self, name: str) -> bool:
         return name in self._archive.NameToInfo
 

@@ -204,6 +204,11 @@ def of_one_sensor(procedure: Procedure, files: Collection[str]) -> str:
     return f"; of a unit without {lacking[0]}, set method.{lacking[0]}=null" if len(lacking) == 1 and others else ""
 
 
+def _copy(values: Mapping[str, Values], channel: str) -> Values | None:
+    """Return a copy of a channel, which does not keep the other columns of its file in memory; None without it."""
+    return values[channel].copy() if channel in values else None
+
+
 def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | None, checks: Checks) -> Recording:
     """Convert a table of channels to a recording in body axes, with quality flags; removes the channels from ``table``.
 
@@ -244,9 +249,9 @@ def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | N
         time_ns=table.time_ns,
         accelerometer=readings["accelerometer"],
         gyroscope=readings["gyroscope"],
-        temperature=values.get("temperature"),
-        table_angle=values.get("table_angle"),
-        table_rate=values.get("table_rate"),
+        temperature=_copy(values, "temperature"),
+        table_angle=_copy(values, "table_angle"),
+        table_rate=_copy(values, "table_rate"),
         table_attitude=_stack(values, ATTITUDE),
         flags=flags,
         source=table.source,

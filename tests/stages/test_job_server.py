@@ -6,11 +6,14 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from calls import imported_by
 
 from pipeline.app.steps.job_server import COMMAND, start_server
+from pipeline.app.steps.unit_files import ResultsInMemory
+from pipeline.core.pack import Pack, new_pack
 
 VERDICT = [*COMMAND, "verdict", "--results", "results", "--output", "done.json", "--failures"]
 
@@ -52,6 +55,57 @@ def test_a_job_ends_with_its_command_and_the_command_with_its_job(tmp_path: Path
             assert command.wait(30) == code
         while _process_in(tmp_path):
             time.sleep(0.05)
+
+
+@pytest.mark.usefixtures("_server")
+def test_the_jobs_of_a_batch_share_a_process_until_one_fails_or_is_killed(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "settings")  # reading it waits for ever
+    (tmp_path / "absent").mkdir()
+    job = [*COMMAND, *["filter", "--ingest", "batches/1/ingest.zip", "--output", "batches/1/filter.zip", "--config"]]
+
+    def refused() -> None:
+        done = subprocess.run([*job, "absent/settings.json"], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (done.returncode, "settings.json" in done.stderr) == (2, True)
+
+    refused()  # its process ends with it: the next job gets another
+    refused()
+    with subprocess.Popen([*job, "settings"], cwd=tmp_path) as command:
+        while not (process := _process_in(tmp_path, but=command.pid)):
+            time.sleep(0.01)
+        refused()  # beside a job that runs
+        os.kill(process, signal.SIGKILL)
+        assert command.wait(30) == 137
+    refused()
+
+
+def test_a_process_keeps_results_as_long_as_their_pack_is_the_same(tmp_path: Path) -> None:
+    path, results = tmp_path / "fit.zip", ResultsInMemory()
+    results.keeps = True
+
+    def written(text: str) -> Pack:
+        with new_pack(path) as add:
+            add({"U1.json": text.encode()})
+        return Pack(path)
+
+    pack = written("1")
+    results.made("U1", "fits", "the fit")
+    results.made("U1", "pages", "a page, which no step reads")
+    results.written(pack)
+    assert results.get(Pack(path), "U1", "fits", lambda: "read") == "the fit"
+    assert results.get(Pack(path), "U1", "pages", lambda: "read") == "read"
+    assert results.get(written("2"), "U1", "fits", lambda: "read") == "read"
+    assert results.get(Pack(path), "U1", "fits", lambda: "read again") == "read"
+
+
+def test_a_process_keeps_no_recordings_beyond_its_memory(tmp_path: Path) -> None:
+    pack, results = Pack(tmp_path / "ingest.zip"), ResultsInMemory()
+    with new_pack(pack.path) as add:
+        add({})
+    results.keeps = True
+    for unit, samples, kept in (("U1", 1_000_000, True), ("U2", 1_000_000, False), ("U3", 10, True)):
+        found = [SimpleNamespace(samples=samples)]
+        assert results.get(pack, unit, "checked", lambda found=found: found) is found
+        assert (results.get(pack, unit, "checked", list) is found) is kept
 
 
 def test_without_a_server_the_command_runs_the_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

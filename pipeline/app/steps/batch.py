@@ -14,6 +14,7 @@ import argparse
 import hashlib
 import json
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -50,6 +51,7 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
 OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous")}
 AFTER_FIT = ("diagnose", "export", "report", "summary", "prior")  # a calibration does not depend on them
 INPUTS_OF = ".inputs"  # member of a pack: digest of a unit's inputs, and the names of its files
+CPU_TIME = "s of CPU time"  # in the last line of a job's log
 # settings by unit, of which ``<stage>_reads`` returns those of one, and how a pack is written
 OF_OTHERS = ("again", "recordings", "last", "packed")
 
@@ -99,8 +101,11 @@ def main(stage: str, argv: Sequence[str]) -> int:
     """
     if stage == "verdict":
         return verdict(argv)
+    start = time.process_time()
     module = import_module(f"pipeline.app.steps.{MODULES[stage]}")
     job = parse_job(stage, argv)
+    from pipeline.app.steps import unit_files  # noqa: PLC0415  (numpy, for the jobs only)
+
     if hasattr(module, f"{stage}_batch"):
         getattr(module, f"{stage}_batch")(job)
         return 0
@@ -122,6 +127,8 @@ def main(stage: str, argv: Sequence[str]) -> int:
     with suppress(OSError):  # on a disk without links, the next run computes every unit
         last_output(job.output).hardlink_to(job.output)
     record_output(job, job.output)
+    unit_files.RESULTS.written(Pack(job.output))
+    print(f"{stage}: {time.process_time() - start:.3f} {CPU_TIME}", file=sys.stderr)
     return 0
 
 
@@ -247,15 +254,17 @@ def _made(module: ModuleType, job: Job, unit: str, settings: Settings) -> Files:
     if job.stage not in STEPS:
         files: Files = getattr(module, f"{job.stage}_unit")(job, unit, settings)
         return files
-    from pipeline.app.steps.unit_files import FILES, StoredUnit  # noqa: PLC0415  (numpy, for the jobs only)
+    from pipeline.app.steps.unit_files import FILES, RESULTS, StoredUnit  # noqa: PLC0415  (numpy, for the jobs only)
 
     stage, last = job.run.get("stage", ""), job.run.get("last", {}).get(unit, "")
     if stage == EFFECTS_STAGE != last:  # other units of the batch have effects
         return {f"{unit}.json": job.inputs["previous"].read(f"{unit}.json")}
     task = Task(job.stage, job.run.get("sensor", ""), stage, last=stage == last)
     made = run_step(task, StoredUnit(job, unit), settings)
-    of_batch = getattr(module, f"{job.stage}_in_batch", None)
-    return FILES[job.stage](unit, of_batch(job, unit, settings, made) if of_batch else made)
+    if of_batch := getattr(module, f"{job.stage}_in_batch", None):
+        made = of_batch(job, unit, settings, made)
+    RESULTS.made(unit, STEPS[job.stage].returns, made)
+    return FILES[job.stage](unit, made)
 
 
 def _encoded(files: Files) -> dict[str, bytes]:
