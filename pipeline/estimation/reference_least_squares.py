@@ -38,7 +38,13 @@ from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.stages import FitStage, StageInput, details_on_table
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import TurnPart, parts_of, rows_of_parts, settled
-from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
+from pipeline.estimation.uncertainty_budget import (
+    base_parameters,
+    budgeted,
+    combined,
+    lines_on_table,
+    noise_contribution,
+)
 from pipeline.physics.effects import stated_priors
 from pipeline.physics.effects.base import truth
 from pipeline.physics.signal.filters import filtered
@@ -53,8 +59,11 @@ ADVICE = {
 }
 
 
-def fit(task: StageInput) -> SensorCalibration:
-    """Fit bias and matrix of a sensor against the table's motion (``pipeline.estimation.stages``); role: the sensor."""
+def fit(task: StageInput, *, details: bool = True) -> SensorCalibration:
+    """Fit bias and matrix of a sensor against the table's motion (``pipeline.estimation.stages``); role: the sensor.
+
+    ``details``: also the result of the stage, the parts of the noise, effects at their limits and the Monte Carlo run.
+    """
     sensor, recordings, settings, prior = task.sensor, task.recordings, task.settings, task.prior
     parts = [_select(sensor, part) for part in parts_of(recordings.filtered, sensor, settings.table, NAME)]
     readings = np.concatenate([part.reading(sensor) for part in parts])
@@ -81,17 +90,21 @@ def fit(task: StageInput) -> SensorCalibration:
     motions = [each.motion(part.motion) for each, part in zip(rows, parts, strict=True) if len(each.count)]
     reference = Reference(sensor, motions, K, settings.table)
     noise = noise_on_table(reference, residuals, X, blocks, prior, count)
+    bench = bench_effects(sensor, settings.table, recordings.filtered)
+    if not (details or bench):
+        rounded, stated, missing = lines_on_table(reference, fit, noise, settings)
+        lines = [noise_contribution(noise, fit, None), *rounded, *stated]
+        return combined(SensorCalibration(sensor, bias, matrix), lines, missing)
     contributions = [noise_contribution(noise, fit, prior)]
-    details = details_on_table(noise, contributions[0].degrees_of_freedom, parts, len(readings), condition)
+    figures = details_on_table(noise, contributions[0].degrees_of_freedom, parts, len(readings), condition)
     result = StageResult(
         name=NAME,
         parameters=base_parameters(sensor, bias, matrix, contributions[0].covariance),
         residual_rms=float(np.sqrt(np.mean(residuals**2))),
-        details=replace(details, residual_rms=np.sqrt(np.mean(residuals**2, axis=0)).tolist()),
+        details=replace(figures, residual_rms=np.sqrt(np.mean(residuals**2, axis=0)).tolist()),
     )
     convergence = linear_convergence(root * X, root * (y - X @ beta), condition, rank)
     found = SensorCalibration(sensor, bias, matrix, stages=(*task.stages, result), convergence=convergence)
-    bench = bench_effects(sensor, settings.table, recordings.filtered)
     if bench and not stated_priors(settings.table):  # else the stage ``effects`` fits them
         return fit_joint(sensor, recordings.filtered, bench, recordings.noises[sensor], settings, found)
     return budgeted(

@@ -80,7 +80,7 @@ from pipeline.estimation.multi_position.model import Model, motion_at_rests
 from pipeline.estimation.table_errors import TIME_BASE, BudgetLines, Reference, table_errors, type_b
 from pipeline.estimation.turns import RowGroups
 from pipeline.physics.effects import catalogue, effect
-from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Effect, Layout, Owner
+from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Effect, Layout, Owner, turning_direction
 
 OWNERS = (Owner.SENSOR, Owner.RECORDING)  # errors of place, table and timing have lines of their own in the budget
 OF_ACCELEROMETER = "accelerometer."  # before an effect of the accelerometer that changes the gyroscope's parameters
@@ -130,7 +130,7 @@ def changes_on_table(
     found: dict[str, Values] = {}
     motions, fit = _in_blocks(centred(reference.motions), fit)
     sensor, K = reference.sensor, reference.K
-    joined = joined_motions(motions)
+    joined = joined_motions([motion.changed(direction=turning_direction(motion)) for motion in motions])
     for this, start, limits in limited_effects(sensor, modelled, data_sheet):
         if not all(this.available(motion) for motion in motions):
             continue
@@ -258,22 +258,24 @@ def effective_degrees_of_freedom(contributions: ArrayLike, degrees_of_freedom: A
     return np.asarray(np.divide(total, share, out=np.full(u.shape[1], np.inf), where=share > 0.0))
 
 
-def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: WanderPrior) -> Contribution:
-    """Return the contribution of white noise, bias instability and lack of fit."""
+def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: WanderPrior | None) -> Contribution:
+    """Return the contribution of white noise, bias instability and lack of fit; with its parts if there is a prior."""
     covariance, freedom = noise.posterior(fit).averaged()
+    if prior is None:
+        return scatter_contribution(covariance, freedom)
     total = np.diag(covariance)
     white, wander = noise.variances(fit, prior)
     white = np.clip(white, 0.0, np.clip(total, 0.0, None))  # rounding may leave a negative zero
     wander = np.clip(wander, 0.0, np.clip(total - white, 0.0, None))
     parts = NoiseParts(np.sqrt(white), np.sqrt(wander), np.sqrt(np.clip(total - white - wander, 0.0, None)))
-    return Contribution(NOISE_SOURCE, "A", "Student's t", covariance, freedom, parts=parts)
+    return scatter_contribution(covariance, freedom, parts)
 
 
 def scatter_contribution(
-    covariance: Values, degrees_of_freedom: float, parts: NoiseParts | None = None, remark: str = ""
+    covariance: Values, degrees_of_freedom: float | Values, parts: NoiseParts | None = None, remark: str = ""
 ) -> Contribution:
     """Return the contribution of the readings' scatter for a fit that computes its covariance directly."""
-    freedom, parts = np.full(len(covariance), float(degrees_of_freedom)), parts or NoiseParts()
+    freedom, parts = np.full(len(covariance), degrees_of_freedom, np.float64), parts or NoiseParts()
     return Contribution(NOISE_SOURCE, "A", "Student's t", covariance, freedom, parts=parts, remark=remark)
 
 
@@ -351,30 +353,39 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     (t, q) errors of the fit's linear map, channel after channel, to (t, p) parameters. ``estimated``: effects of a
     joint fit, whose noise contains that of rounding; an error that one of them estimates is no input.
     """
-    sensor, joint, estimated = calibration.sensor, estimated is not None, estimated or ()
-    counts = settings.sensor.of(sensor).counts_per_unit
-    found, absent = table_errors(reference, fit, estimated)
-    if TILT in estimated and tilt_like_zeros(reference.motions, estimated) is not None:
-        absent["levelling"] = ACROSS
-
-    def rounding(fit: LinearMap) -> BudgetLines:
-        if joint:
-            return [], {QUANTISATION_SOURCE: f"contained in the {NOISE_SOURCE}"}
-        return _quantisation(noise, fit, counts, SENSOR_UNITS[sensor])
-
-    rounded, contained = rounding(fit)
-    modelled = [*estimated, *(e.name for e in calibration.effects)]
+    sensor = calibration.sensor
+    rounded, found, missing = lines_on_table(reference, fit, noise, settings, estimated)
+    modelled = [*(estimated or ()), *(e.name for e in calibration.effects)]
     at_limits = changes_on_table(reference, fit, modelled, settings.sensor.of(sensor))
-    missing = {**absent, "temperature": TEMPERATURE, **contained}
     complete = combined(replace(calibration, at_limits=at_limits), [*contributions, *rounded, *found], missing)
     trials = settings.uncertainty.monte_carlo
     if not trials:
         return complete
     first = fit.first()
-    stated, _ = table_errors(reference, first, estimated)
-    covariances = [c.covariance for c in (*stated, *rounding(first)[0])]
-    draw = through(noise.posterior(first), covariances, results)
+    rounded, found, _ = lines_on_table(reference, first, noise, settings, estimated)
+    draw = through(noise.posterior(first), [c.covariance for c in (*found, *rounded)], results)
     return with_trials(complete, draw, trials, contributions[1:])
+
+
+def lines_on_table(
+    reference: Reference,
+    fit: LinearMap,
+    noise: ResidualNoise,
+    settings: Settings,
+    estimated: Sequence[str] | None = None,
+) -> tuple[list[Contribution], list[Contribution], dict[str, str]]:
+    """Return the contributions of rounding and of the stated accuracies, and reasons for those not included.
+
+    Arguments: see ``budgeted``.
+    """
+    found, missing = table_errors(reference, fit, estimated or ())
+    if estimated and TILT in estimated and tilt_like_zeros(reference.motions, estimated) is not None:
+        missing["levelling"] = ACROSS
+    rounded, contained = list[Contribution](), {QUANTISATION_SOURCE: f"contained in the {NOISE_SOURCE}"}
+    if estimated is None:
+        counts = settings.sensor.of(reference.sensor).counts_per_unit
+        rounded, contained = _quantisation(noise, fit, counts, SENSOR_UNITS[reference.sensor])
+    return rounded, found, {**missing, "temperature": TEMPERATURE, **contained}
 
 
 def covariance_without_reference(calibration: SensorCalibration) -> Values:

@@ -290,12 +290,10 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
         calibrated.append(recording.with_readings(flags=np.where(known, flags, flags | STUCK), **values))
     at_rest = [r for r in case.recordings if r.role == "static"]
     table = settings.table.replaced(**dict.fromkeys(bench_priors().values()))
-    without_limits = settings.sensor.of(sensor).replaced(effects={})
-    own = settings.sensor.replaced(**{sensor: without_limits})  # for the limits of effects, which E has no part in
-    plain = settings.replaced(sensor=own, table=table, uncertainty=Uncertainty(monte_carlo=0))
+    plain = settings.replaced(table=table, uncertainty=Uncertainty(monte_carlo=0))
     held_out_and_static = UnitRecordings([*calibrated, *at_rest], {sensor: case.noise})
     try:
-        fit = reference_least_squares.fit(StageInput(sensor, held_out_and_static, None, plain))
+        fit = reference_least_squares.fit(StageInput(sensor, held_out_and_static, None, plain), details=False)
     except (CannotCalibrateError, NotObservableError):
         return None
     slopes /= sum(part.number for part in parts)
@@ -464,9 +462,8 @@ def _fitted(calibration: SensorCalibration, part: str, left: Values, truth: Valu
     known = np.isfinite(left + truth).all(axis=1)
     left, truth = left[known], truth[known]
     reading = left @ K.T  # minus the bias
-    ones = np.ones((len(reading), 1))
-    spread = np.linalg.svd(reading - reading.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(reading))
-    if part == "none" or spread < LEAST_SPREAD_G:
+    ones, off = np.ones((len(reading), 1)), reading - reading.mean(axis=0)
+    if part == "none" or np.linalg.eigvalsh(off.T @ off)[0] < LEAST_SPREAD_G**2 * len(reading):
         offset = np.mean(truth - reading @ matrix.T, axis=0)
     elif part == "full":
         *rows, offset = np.linalg.lstsq(np.hstack([reading, ones]), truth, rcond=None)[0]
