@@ -164,7 +164,7 @@ class TextLayout:
     def parse(self, body: bytes, types: Mapping[int, Any]) -> Any:  # noqa: ANN401  (pyarrow has no types)
         """Parse columns of rows to a pyarrow table, by their index; raises ``ArrowInvalid`` if a row does not fit."""
         names = [str(i) for i in range(len(self.names))]
-        return arrow_csv.read_csv(
+        return arrow_csv.open_csv(  # of one block; read_csv takes 50 us more to start
             pa.py_buffer(body),
             arrow_csv.ReadOptions(use_threads=False, block_size=len(body) + 1, column_names=names),
             arrow_csv.ParseOptions(delimiter=self.delimiter, quote_char='"' if b'"' in body else False),
@@ -175,7 +175,7 @@ class TextLayout:
                 check_utf8=False,
                 decimal_point=self.decimal,
             ),
-        )
+        ).read_all()
 
     def numbers(self, body: bytes, rows: int) -> dict[int, Values] | None:
         """Parse the used columns to numbers, by index; None if a cell is not a finite number."""

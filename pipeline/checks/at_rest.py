@@ -37,7 +37,7 @@ import numpy as np
 
 from imu_logs.units import TRIADS
 from pipeline.checks.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, refusal
-from pipeline.core.records import SENSOR_UNITS, SENSORS, Integers, Mask, Note, Recording, Values, median
+from pipeline.core.records import SENSOR_UNITS, SENSORS, Integers, Mask, Note, Recording, Values, median, once
 from pipeline.core.settings import DataSheet, Sensor, Settings
 from pipeline.physics.kinematics import EARTH_RATE_DPS
 from pipeline.physics.signal.rests import RATE_AT_REST, RATE_AT_REST_DPS, rests_from_table, runs
@@ -102,10 +102,10 @@ def _doubted(
         reading, rests = recording.reading(sensor), rests_of[sensor]
         if not len(rests):
             rests = _rests_by_hand(recordings, sensor)
-        if reading is None or not len(rests) or not len(blocks := _blocks(recording, reading)):
+        if reading is None or not len(rests) or not len(moments := _moments_of_blocks(recording, sensor)):
             continue
         step = _digit(reading)
-        static, usual = median(_moments(blocks.reshape(-1, 3), np.full(*blocks.shape[:2]))), median(rests)
+        static, usual = median(moments), median(rests)
         louder = float(np.max(static[0] / np.maximum(usual[0], step)))
         quieter = float(np.min(usual[1] / np.maximum(static[1], step)))
         if louder > MAX_TIMES_RESTS * faster:
@@ -132,7 +132,7 @@ def _doubted(
 
 def _digit(reading: Values) -> Values:
     """Return the smallest change of each axis between two samples, infinity for a constant one: (3,) array."""
-    step = np.abs(np.diff(reading, axis=0))
+    step = np.abs(np.diff(np.asfortranarray(reading), axis=0))  # numpy is fast along a contiguous axis
     return np.asarray(np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf))
 
 
@@ -167,11 +167,9 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_model:
         moving = rate >= RATE_AT_REST_DPS
         why = f"the table turns at up to {rate.max():.3g} deg/s" if moving.any() else ""
     for sensor in SENSORS:
-        reading = recording.reading(sensor)
-        if reading is None:
+        if recording.reading(sensor) is None:
             continue
-        blocks = _blocks(recording, reading)
-        moves, what = _moving(recording, sensor, blocks, sensor_model.of(sensor), rests_of[sensor])
+        moves, what = _moving(recording, sensor, sensor_model.of(sensor), rests_of[sensor])
         why = why or (what if moves.any() else "")
         moving |= moves
     if not moving.any():
@@ -194,11 +192,13 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_model:
     return replace(recording.select(slice(start, stop)), notes=(*recording.notes, note))
 
 
-def _moving(recording: Recording, sensor: str, blocks: Values, sheet: DataSheet, rests: Values) -> tuple[Mask, str]:
+def _moving(recording: Recording, sensor: str, sheet: DataSheet, rests: Values) -> tuple[Mask, str]:
     """Return in which blocks a sensor moves, and the strongest evidence of it in words."""
     unit = SENSOR_UNITS[sensor]
-    means, scatter = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
-    usual, middle = np.percentile(scatter, [25.0, 50.0], axis=0)
+    scatter, _, means = np.moveaxis(_moments_of_blocks(recording, sensor), 1, 0)
+    ordered, place = np.sort(scatter, axis=0), 0.25 * (len(scatter) - 1)  # np.percentile is slow
+    usual, middle = ordered[int(place)], median(scatter)
+    usual = usual + place % 1.0 * (ordered[int(place) + 1] - usual)
     tiny = np.finfo(float).tiny
     spread = np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE
     louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * np.minimum(spread, MAX_SCATTER_DEVIATION)))
@@ -207,7 +207,7 @@ def _moving(recording: Recording, sensor: str, blocks: Values, sheet: DataSheet,
         usual = np.minimum(usual, MAX_TIMES_RESTS * np.maximum(np.median(rests[:, 0], axis=0), white))
     elif white:
         usual = np.minimum(usual, MAX_TIMES_DATA_SHEET * white)
-    usual = np.maximum(usual, 0.5 * _digit(blocks.reshape(-1, 3)))
+    usual = np.maximum(usual, 0.5 * _digit(_blocks(recording, np.asarray(recording.reading(sensor))).reshape(-1, 3)))
     loud = scatter / usual
     away = np.abs(means - median(means))
     change = UNKNOWN_DEGC if recording.temperature is None else float(np.ptp(recording.temperature))
@@ -246,9 +246,10 @@ def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
         if not (long := long[:: len(long) // MIN_RESTS_OF_SCATTER + 1]).size:
             continue
         rows = np.concatenate([rows[starts[k] : ends[k]] for k in long])
-        for sensor in SENSORS:
-            if (reading := recording.reading(sensor)) is not None:
-                moments[sensor].append(_moments(reading[rows], (ends - starts)[long]))
+        found = {s: reading for s in SENSORS if (reading := recording.reading(s)) is not None}
+        parts = _moments(np.concatenate([reading[rows] for reading in found.values()], axis=1), (ends - starts)[long])
+        for k, sensor in enumerate(found):
+            moments[sensor].append(parts[..., 3 * k : 3 * k + 3])
     return {sensor: np.concatenate(parts) for sensor, parts in moments.items()}
 
 
@@ -257,15 +258,22 @@ def _rests_by_hand(recordings: Sequence[Recording], sensor: str) -> Values:
     found = [np.zeros((0, 3, 3))]
     for recording in recordings:
         reading = recording.reading(sensor) if recording.role == "rests" else None
-        if reading is None or len(blocks := _blocks(recording, reading)) < 10:
+        if reading is None or len(moments := _moments_of_blocks(recording, sensor)) < 10:
             continue
-        scatter, white, _ = np.percentile(_moments(blocks.reshape(-1, 3), np.full(*blocks.shape[:2])), 10.0, axis=0)
+        scatter, white, _ = np.percentile(moments, 10.0, axis=0)
         found.append(np.stack([scatter, white, np.full(3, np.nan)])[None])
     return np.concatenate(found)
 
 
+@once
+def _moments_of_blocks(recording: Recording, sensor: str) -> Values:
+    """Return ``_moments`` of a sensor in blocks of a second: (k, 3, 3) array."""
+    blocks = _blocks(recording, np.asarray(recording.reading(sensor)))
+    return _moments(blocks.reshape(-1, 3), np.full(*blocks.shape[:2])) if len(blocks) else np.zeros((0, 3, 3))
+
+
 def _moments(values: Values, sizes: Integers) -> Values:
-    """Return scatter, white noise and mean of the parts with k numbers of samples of (n, 3) values: (k, 3, 3) array.
+    """Return scatter, white noise and mean of the parts with k numbers of samples of (n, c) values: (k, 3, c) array.
 
     The white noise by successive differences does not include slow changes (J. von Neumann, Annals of Mathematical
     Statistics 12 (1941), 367-395).
@@ -274,9 +282,9 @@ def _moments(values: Values, sizes: Integers) -> Values:
     mean = np.add.reduceat(values, starts) / size
     change = np.diff(values, axis=0, append=values[-1:])
     change[starts + sizes - 1] = 0.0  # to the next part
-    squares = np.hstack([(values - np.repeat(mean, sizes, axis=0)) ** 2, 0.5 * change**2])
-    spread = np.sqrt(np.add.reduceat(squares, starts) / (size - 1))
-    return np.stack([spread[:, :3], spread[:, 3:], mean], axis=1)
+    squares = np.stack([(values - np.repeat(mean, sizes, axis=0)) ** 2, 0.5 * change**2])
+    spread = np.sqrt(np.add.reduceat(squares, starts, axis=1) / (size - 1))
+    return np.stack([*spread, mean], axis=1)
 
 
 def check_axes(recordings: Sequence[Recording]) -> None:

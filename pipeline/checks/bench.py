@@ -182,7 +182,7 @@ def nearest_axis(direction: Values) -> str:
 
 def off_axis_deg(direction: Values) -> float:
     """Return the angle between a direction and the nearest signed axis, deg."""
-    return float(np.degrees(np.arccos(np.clip(np.max(np.abs(direction)) / np.linalg.norm(direction), -1.0, 1.0))))
+    return float(np.degrees(np.arccos(min(float(np.max(np.abs(direction)) / np.linalg.norm(direction)), 1.0))))
 
 
 def unit(vector: Values) -> Values:
@@ -237,16 +237,16 @@ def fit_turn(recording: Recording) -> TurnFit:
         missing = "angle of the table" if angle is None else "accelerometer"
         return TurnFit(None, gain, unknown=f"the log holds no {missing}")
     keep = recording.valid
-    A, reading = np.radians(angle[keep]), recording.accelerometer[keep]
+    A = np.radians(angle[keep])
     arc = float(np.ptp(angle)) if len(angle) else 0.0
     mean_rate = 0.0 if slope is None else float(np.mean(slope))
     terms = [np.ones_like(A)]
     if used is not None and np.any(used[keep]):
         r = used[keep] / np.max(np.abs(used))
         terms += [r, np.abs(r), r * r]
-    # Normal equations of all columns; the constant and the terms of the rate are eliminated.
-    columns, m = np.column_stack([*terms, np.cos(A), np.sin(A), reading]), len(terms)
-    products = columns.T @ columns
+    # Normal equations of all terms; the constant and the terms of the rate are eliminated.
+    rows, m = np.stack([*terms, np.cos(A), np.sin(A), *recording.accelerometer[keep].T]), len(terms)
+    products = rows @ rows.T
     powers, vectors = np.linalg.eigh(products[:m, :m])
     vectors = vectors[:, powers > SMALLEST_SHARE * powers[-1]]
     inverse = vectors / powers[m - vectors.shape[1] :] @ vectors.T
@@ -254,12 +254,14 @@ def fit_turn(recording: Recording) -> TurnFit:
     normal = reduced[:2, :2]
     if len(A) < MIN_ANGLE_SAMPLES or np.linalg.eigvalsh(normal / len(A))[0] < LEAST_COVERAGE:
         return TurnFit(None, gain, mean_rate, arc, f"the table angle covers {arc:.3g} deg only")
-    p_and_q = np.linalg.solve(normal, reduced[:2, 2:])
+    inverse = np.linalg.inv(normal)
+    p_and_q = inverse @ reduced[:2, 2:]
     variance = np.diag(reduced[2:, 2:] - reduced[2:, :2] @ p_and_q) / len(A)
-    scatter = float(np.sqrt(np.max(variance.clip(0.0)) * np.max(np.diag(np.linalg.inv(normal)))))
+    scatter = float(np.sqrt(np.max(variance.clip(0.0)) * np.max(np.diag(inverse))))
     if scatter > MAX_DIRECTION_UNCERTAINTY_G:
         return TurnFit(None, gain, mean_rate, arc, "the accelerometer does not follow the table angle")
-    constant = np.mean(reading, axis=0) - np.mean(columns[:, m : m + 2], axis=0) @ p_and_q
+    means = products[0, m:] / len(A)
+    constant = means[2:] - means[:2] @ p_and_q
     return TurnFit(FittedGravity(constant, *p_and_q), gain, mean_rate, arc)
 
 
@@ -269,15 +271,17 @@ def _gain(recording: Recording, rate: Values | None) -> Values | None:
         return None
     keep = recording.valid
     rate, gyro = rate[keep], recording.gyroscope[keep]
-    changing = float(np.std(rate)) > CHANGING * float(np.max(np.abs(rate), initial=0.0))
+    largest, n = float(np.max(np.abs(rate), initial=0.0)), max(len(rate), 1)
+    change = rate - np.sum(rate) / n
+    changing = float(np.sqrt(change @ change / n)) > CHANGING * largest
     if changing:
-        rate, gyro = rate - np.mean(rate), gyro - np.mean(gyro, axis=0)
+        rate, gyro = change, gyro - np.sum(gyro, axis=0) / n
     power = float(rate @ rate)
     if power <= len(rate) * (MIN_FOLLOWED_RATE_DPS if changing else LARGEST_BIAS_DPS) ** 2:
         return None
     gain = rate @ gyro / power
-    largest = int(np.argmax(np.abs(gain)))
-    alike = abs(gain[largest]) * np.sqrt(power / max(float(gyro[:, largest] @ gyro[:, largest]), 1e-30))
+    axis = int(np.argmax(np.abs(gain)))
+    alike = abs(gain[axis]) * np.sqrt(power / max(float(gyro[:, axis] @ gyro[:, axis]), 1e-30))
     return np.asarray(gain) if alike >= MIN_GAIN_CORRELATION else None
 
 

@@ -107,8 +107,10 @@ class Channel:
 
 
 def quantiles(values: Values, *shares: float) -> Values:
-    """Return quantiles without interpolation; numpy partitions the many equal values of a table's log slowly."""
-    return np.asarray(np.sort(values, axis=0)[[round(share * (len(values) - 1)) for share in shares]])
+    """Return quantiles without interpolation; numpy partitions many equal values fast only at several places."""
+    last = len(values) - 1
+    places = [round(share * last) for share in shares]
+    return np.asarray(np.partition(values, [*places, last], axis=0)[places])
 
 
 @once_of_log
@@ -166,7 +168,7 @@ def alike(one: Values, two: Values) -> float:
     """Return the correlation of two angles turned in blocks; 0 if one does not turn."""
     starts = np.arange(0, len(one), SIGN_BLOCK)
     a, b = np.add.reduceat(one, starts), np.add.reduceat(two, starts)
-    size = float(np.linalg.norm(a) * np.linalg.norm(b))
+    size = float(np.sqrt((a @ a) * (b @ b)))
     return float(a @ b) / size if size > 0.0 else 0.0
 
 
@@ -181,8 +183,9 @@ def gravity_turned(recording: Recording) -> Values | None:
     centred = across - np.where(high - low > 3.0 * LEAST_SWING_G, (low + high) / 2.0, 0.0)
     if float(median(np.hypot(*centred.T))) < LEAST_SWING_G:
         return None
-    phase = np.degrees(np.unwrap(np.arctan2(centred[:, 1], centred[:, 0])))
-    turned = np.diff(phase)
+    turned = np.diff(np.degrees(np.arctan2(centred[:, 1], centred[:, 0])))
+    turned -= 360.0 * np.rint(turned / 360.0)
+    phase = np.append(0.0, np.cumsum(turned))
     if float(np.ptp(phase)) < MIN_GRAVITY_TURN_DEG or float(quantiles(np.abs(turned), 0.99)[0]) > FASTEST_DEG:
         return None
     turned[gaps(recording)] = 0.0
@@ -191,9 +194,10 @@ def gravity_turned(recording: Recording) -> Values | None:
 
 def of_gravity(recording: Recording, turned: Values, channels: Sequence[Channel]) -> Channel:
     """Return the rotation by gravity, with the sign of the gyroscope or, without it, of the most similar channel."""
-    correlations = {c.name: alike(turned, c.turned) for c in channels}
-    sure = abs(correlations.get("gyroscope", 0.0)) > OPPOSITE
-    sign = -1.0 if (correlations["gyroscope"] if sure else max(correlations.values(), key=abs)) < 0.0 else 1.0
+    correlation = next((alike(turned, c.turned) for c in channels if c.name == "gyroscope"), 0.0)
+    if abs(correlation) <= OPPOSITE:
+        correlation = max((alike(turned, c.turned) for c in channels), key=abs)
+    sign = -1.0 if correlation < 0.0 else 1.0
     noise = float(noise_of_steps(np.abs(np.diff(turned)))) / recording.interval
     return replace(_of_turned("gravity", recording, sign * turned), noise=noise)
 
@@ -206,16 +210,18 @@ def ratio_quantiles(one: Values, other: Values, cut: int, least: float, *shares:
     size = np.abs(other)
     largest = largest_but(size, cut)
     used = size > least * largest
-    weight, ratio = np.minimum(size[used], largest), (one[used].T / other[used]).T
-    order = np.argsort(ratio, axis=0)
-    total = np.cumsum(weight[order], axis=0) / weight.sum()
-    places = np.stack([np.count_nonzero(total < share, axis=0) for share in shares])
-    return np.take_along_axis(ratio, np.take_along_axis(order, places, axis=0), axis=0)
+    weight, ratio = np.minimum(size[used], largest), np.atleast_2d(one[used].T) / other[used]
+    order = np.argsort(ratio, axis=1)
+    total = np.cumsum(weight[order], axis=1) / weight.sum()
+    rows = zip(ratio, order, total, strict=True)
+    found = np.stack([values[places[np.searchsorted(sums, shares)]] for values, places, sums in rows], axis=1)
+    return found if one.ndim > 1 else found[:, 0]
 
 
 def largest_but(size: Values, cut: int) -> float:
     """Return the value that a share ``1 / cut`` of all values reaches."""
-    return float(np.sort(size)[-max(len(size) // cut, 1)])
+    place = len(size) - max(len(size) // cut, 1)
+    return float(np.partition(size, (place, len(size) - 1))[place])  # as in ``quantiles``
 
 
 def axis_index(recording: Recording) -> int:

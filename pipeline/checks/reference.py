@@ -105,6 +105,7 @@ class ChannelComparison:
         self.recording, self.channels, self.limits = recording, channels, limits
         self.dt = recording.time_steps
         self.interval = float(median(self.dt))
+        self._parts: dict[str, tuple[Values, Values]] = {}  # by channel
         self._summed: dict[tuple[str, int], tuple[Values, Values, Values, Values]] = {}  # by channel and size
         self.known = np.ones(len(self.dt), bool)  # intervals in which every channel is known
         for channel in channels:
@@ -117,12 +118,15 @@ class ChannelComparison:
         if not others or claim.name in OF_SENSOR:
             return None
         alone = all(w.name in OF_SENSOR for w in others)
-        rows: list[tuple[Values, Values]] = []  # effects allow at least what the stated accuracy allows
-        while len(rows) < len(others) and (not rows or np.any(np.min([doubt for _, doubt in rows], axis=0) > 0.0)):
+        rows: list[tuple[Values, Values]] = []
+        least, doubtful = np.full(len(claim.low), np.inf), True
+        while len(rows) < len(others) and doubtful:
             rows.append(self._rows(claim, others[len(rows)], alone=alone))
+            least = np.minimum(least, rows[-1][1])
+            doubtful = bool((least > 0.0).any())  # effects allow at least what the stated accuracy allows
         gross, doubt = zip(*rows, strict=True)
-        contradiction = self._worst_row(claim, others, gross) or self._worst_stretch(claim, others)
-        found = contradiction or self._worst_row(claim, others, doubt)
+        contradiction = (doubtful and self._worst_row(claim, others, gross)) or self._worst_stretch(claim, others)
+        found = contradiction or (doubtful and self._worst_row(claim, others, doubt))
         if not found:
             return None
         name, *names = (self.limits.column(self.recording, c.name) for c in (claim, *others))
@@ -177,7 +181,6 @@ class ChannelComparison:
         for size in sorted({SHORT_STRETCH_SAMPLES, max(n // LONG_STRETCHES, SHORT_STRETCH_SAMPLES)}):
             starts = np.arange(0, max(n - size // 2, 1), size)
             turned, total, bends, _ = self._sums(claim, size, starts)
-            length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)
             excess, sums = [], []
             for other in others:
                 shown, shown_total, shown_bends, swing = self._sums(other, size, starts)
@@ -186,16 +189,19 @@ class ChannelComparison:
                 if claim.of_intervals or other.of_intervals:
                     allowed += limits.angle_deg
                 if other.name in OF_SENSOR:
+                    length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)
                     share = PHASE if other.name == "gravity" else limits.gain
                     noise = BY_NOISE * other.noise * self.interval * (1.0 if other.of_intervals else np.sqrt(size))
                     allowed += share * most + limits.late_s * swing + limits.offset_dps * length + noise
                 excess.append(np.abs(turned - shown) - allowed)
                 sums.append(shown)
-                if np.all(excess[-1] <= 0.0):
+                if (excess[-1] <= 0.0).all():
                     break
-            off = np.min(excess, axis=0)
-            rows = np.flatnonzero(off > 0.0)
-            if rows.size:
+            else:
+                off = np.min(excess, axis=0)
+                rows = np.flatnonzero(off > 0.0)
+                if not rows.size:
+                    continue
                 worst = int(np.argmax(off))
                 shown = sums[int(np.argmin([e[worst] for e in excess]))]
                 first, last = int(starts[rows[0]]), min(int(starts[rows[-1]]) + size, n)
@@ -212,13 +218,18 @@ class ChannelComparison:
         """Return for each stretch: angle, sum of its magnitudes, squared error by bends, and range of the rate."""
         if (channel.name, size) in self._summed:
             return self._summed[channel.name, size]
-        turned, bend = np.where(self.known, channel.turned, 0.0), np.zeros(len(self.dt))
-        rate = np.where(self.known, channel.low if channel.of_intervals else channel.low[1:], 0.0)
-        if not channel.of_intervals:
-            steps = np.diff(np.where(np.isfinite(channel.low), channel.low, 0.0))
-            bend = (np.where(self.known, 0.5 * steps, 0.0) * self.dt) ** 2
+        if channel.name not in self._parts:
+            each = np.zeros((3, len(self.dt)))
+            each[0] = np.where(self.known, channel.turned, 0.0)
+            np.abs(each[0], out=each[1])
+            if not channel.of_intervals:
+                steps = np.diff(np.where(np.isfinite(channel.low), channel.low, 0.0))
+                each[2] = (np.where(self.known, 0.5 * steps, 0.0) * self.dt) ** 2
+            rate = np.where(self.known, channel.low if channel.of_intervals else channel.low[1:], 0.0)
+            self._parts[channel.name] = each, rate
+        each, rate = self._parts[channel.name]
+        angle, total, bends = np.add.reduceat(each, starts, axis=1)
         swing = np.maximum.reduceat(rate, starts) - np.minimum.reduceat(rate, starts)
-        angle, total, bends = (np.add.reduceat(v, starts) for v in (turned, np.abs(turned), bend))
         self._summed[channel.name, size] = angle, total, bends, swing
         return angle, total, bends, swing
 
@@ -350,7 +361,7 @@ class _Gyroscope:
         """Return the angular rate: (n, 3) array, deg/s; None if no turn determines the bias."""
         if recording.gyroscope is None or self.bias is None:
             return None
-        return np.asarray(np.linalg.solve(self.matrix, (recording.gyroscope - self.bias).T).T)
+        return np.asarray((recording.gyroscope - self.bias) @ np.linalg.inv(self.matrix).T)
 
 
 @once
@@ -368,7 +379,7 @@ def _slopes(recording: Recording) -> Values:
 
 def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: ChannelLimits) -> tuple[list[Note], Delay | None]:
     channels, axis = [*of_table(recording)], axis_index(recording)
-    if any(alike(c.turned, channels[0].turned) < -OPPOSITE for c in channels):
+    if any(alike(c.turned, channels[0].turned) < -OPPOSITE for c in channels[1:]):
         rate, angle = (limits.column(recording, name) for name in ("table_rate", "table_angle"))
         problem = f"{rate} and the change of {angle} have opposite signs"
         hint = f"negate the column of one, or leave {rate} out (ingest.csv.columns.table_rate=null)"
@@ -458,11 +469,15 @@ def _delay_of(recording: Recording, channels: Sequence[Channel], limits: Channel
         allowed = limits.late_s + (limits.clock * float(recording.time[-1]) if of_sensor else 0.0)
         step, one, two = _thinned(first, other, recording)
         furthest = min(max(int(np.ceil(min(allowed, FURTHEST_S) / step)), FURTHEST), len(one) // 4)
+        one, two = one - one.mean(), two - two.mean()
         squares, steps = _variances(one[furthest : len(one) - furthest], two), len(one) - 2 * furthest
-        power = min(float(np.var(one)), float(np.var(two)))
+        power = min(float(one @ one), float(two @ two)) / len(one)
         if float(squares.min()) >= BETTER * power:
             continue  # nothing moves, or they are not alike at any delay
-        interval = _interval(squares, NEARLY * power, steps)
+        open_to = _possible(squares, steps)
+        if open_to[furthest] and not of_sensor:
+            continue  # no delay is possible
+        interval = _interval(squares, open_to, NEARLY * power)
         if interval is None:
             continue
         best, low, high = ((d - furthest) * step for d in interval)
@@ -478,13 +493,16 @@ def _delay_of(recording: Recording, channels: Sequence[Channel], limits: Channel
 
 
 def _variances(fixed: Values, moved: Values) -> Values:
-    """Return the variance of the difference between (n,) values and each n successive ones of (m,): (m - n + 1,)."""
-    n, one, two = len(fixed), fixed - fixed.mean(), moved - moved.mean()
-    total, squares = (np.append(0.0, np.cumsum(v)) for v in (two, two * two))
-    power = one @ one
-    difference = power + squares[n:] - squares[:-n] - 2.0 * np.correlate(two, one, "valid")
+    """Return the variance of the difference between (n,) values and each n successive ones of (m,): (m - n + 1,).
+
+    ``moved``: values of mean 0, so that the sums of their squares lose no digits.
+    """
+    n, one = len(fixed), fixed - fixed.mean()
+    end, power = len(moved) - n, one @ one
+    total, squares = (np.cumsum(np.append(v[:n].sum(), v[n:] - v[:end])) for v in (moved, moved * moved))
+    difference = power + squares - 2.0 * np.correlate(moved, one, "valid")
     rounding = np.finfo(float).eps * power
-    return np.asarray(np.maximum(difference - (total[n:] - total[:-n]) ** 2 / n, rounding) / n)
+    return np.asarray(np.maximum(difference - total**2 / n, rounding) / n)
 
 
 def _check_delays(found: Sequence[tuple[Recording, Delay]], limits: ChannelLimits) -> None:
@@ -537,18 +555,22 @@ def _thinned(first: Channel, other: Channel, recording: Recording) -> tuple[floa
     return size * recording.interval, one, two
 
 
-def _interval(squares: Values, room: float, steps: int) -> tuple[float, float, float] | None:
-    """Return the index of the minimum, and of the first and the last delay that the steps do not exclude.
-
-    None if they exclude neither the first nor the last of all delays tried.
-    """
-    best = _nearest_minimum(squares, room)
+def _possible(squares: Values, steps: int) -> Mask:
+    """Return which of the delays tried the steps do not exclude."""
     least = max(float(squares.min()), float(np.finfo(float).tiny))
     over = np.log(np.maximum(squares, least)) - np.log(least)  # their quotient may exceed the largest number
-    open_to = np.flatnonzero(steps * over <= SURE_END_DEVIATIONS * np.sqrt(2.0 * len(squares)))
-    if open_to[0] == 0 and open_to[-1] == len(squares) - 1:
+    return np.asarray(steps * over <= SURE_END_DEVIATIONS * np.sqrt(2.0 * len(squares)))
+
+
+def _interval(squares: Values, open_to: Mask, room: float) -> tuple[float, float, float] | None:
+    """Return the index of the minimum, and of the first and the last delay that is possible.
+
+    None if neither the first nor the last of all delays tried is excluded.
+    """
+    if open_to[0] and open_to[-1]:
         return None
-    return best, min(best, float(open_to[0])), max(best, float(open_to[-1]))
+    best, possible = _nearest_minimum(squares, room), np.flatnonzero(open_to)
+    return best, min(best, float(possible[0])), max(best, float(possible[-1]))
 
 
 def _nearest_minimum(squares: Values, room: float) -> float:

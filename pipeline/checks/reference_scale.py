@@ -46,7 +46,7 @@ from pipeline.checks.evidence import (
     refusal,
 )
 from pipeline.core.errors import IngestError
-from pipeline.core.records import MEDIAN_SIZE, Mask, Recording, Values
+from pipeline.core.records import MEDIAN_SIZE, Mask, Recording, Values, median
 from pipeline.core.settings import Table
 
 Units = Sequence[tuple[float, str]]
@@ -225,7 +225,7 @@ def _gear(recording: Recording, allowed: float) -> tuple[float, float] | None:
         c2, s2 = c * c - s * s, 2.0 * c * s  # of the double angle
         columns = [np.ones_like(a), c, s, w * c, w * s, w * w, slope, late, late * late]
         columns += [c2, s2, c2 * c - s2 * s, s2 * c + c2 * s]
-        Q, R = np.linalg.qr(np.stack(columns, axis=1))
+        Q, R = np.linalg.qr(np.stack(columns).T)
         _, cosine, sine = np.linalg.solve(R[:3, :3], Q[:, :3].T @ y.T)[..., None]
         drifts = np.stack([late, late * late], axis=1) * (cosine * c + sine * s)[..., None]
         own = np.linalg.qr(drifts - Q @ (Q.T @ drifts))[0]
@@ -286,8 +286,8 @@ def rate_against_angle(recording: Recording) -> tuple[float, float, int] | None:
         fit = _against_phase(recording, 0.5 * (rate[1:] + rate[:-1]) * dt, even)
         return None if fit is None else (*fit, samples)
     found = rate[1:][even] * dt[even] / np.diff(recording.table_angle)[even]
-    ratio = float(np.median(found))
-    return ratio, MEDIAN_SIZE * float(np.median(np.abs(found - ratio))) / np.sqrt(samples), samples
+    ratio = float(median(found))
+    return ratio, MEDIAN_SIZE * float(median(np.abs(found - ratio))) / np.sqrt(samples), samples
 
 
 def rate_error(recordings: Sequence[Recording], table: Table) -> float:
@@ -332,7 +332,8 @@ def _in_blocks(turned: Values | None) -> Values | None:
     """Return the angle turned in each block of a recording: (96,) array, deg."""
     if turned is None:
         return None
-    starts = np.linspace(0, len(turned), min(RATIO_BLOCKS, len(turned)), endpoint=False).astype(int)
+    count = min(RATIO_BLOCKS, len(turned))
+    starts = (np.arange(count) * (len(turned) / count)).astype(int)
     return np.asarray(np.add.reduceat(turned, starts))
 
 

@@ -219,13 +219,13 @@ def seat_notes(turns: Sequence[TurnRecording], table: Table, sensor: Sensor) -> 
         doubt = np.max(np.abs(found.seats)) > allowed and not _table_explains(slow, found.K, limits)
         if doubt:
             details |= dict.fromkeys((c.turn.name for c in slow), _seats_in_words(slow, found, allowed))
-        for fast in every:
+        for fast in (c for c in every if c.turn.recording.role == "gyroscope"):
             # Against the body axis, or the axis of another turn about it, whichever is nearer: if the table's axes
             # lean, the turns for the gyroscope lean with those for the accelerometer.
             alike = [] if doubt else [slower.normal(found.K) for slower in slow if slower.axis == fast.axis]
             rotations = np.degrees(cross(fast.normal(found.K), np.array([np.eye(3)[fast.axis], *alike])))
             off = min(rotations, key=lambda v: float(v @ v))
-            if fast.turn.recording.role == "gyroscope" and np.max(np.abs(off)) > allowed:
+            if np.max(np.abs(off)) > allowed:
                 details[fast.turn.name] = (
                     f"the mounting of the unit in {fast.turn.name} differs from that in the turns for the "
                     f"accelerometer, by more than {allowed:.2g} deg: by gravity it is rotated by {_in_words(off)}, and "

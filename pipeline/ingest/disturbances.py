@@ -25,7 +25,6 @@ with ``nu = 3 (n - 1)``, m the mean of the piece and s the median scatter of an 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -79,9 +78,9 @@ def leave_out_disturbances(recording: Recording, note: Callable[[str, Index, str
         return recording
     excess, where = disturbed(recording)
     excess[~recording.valid] = 0.0  # no fit looks at them
-    rows = np.flatnonzero(np.any(excess > 0, axis=1))
-    if not rows.size:
+    if not excess.any():
         return recording
+    rows = np.flatnonzero(np.any(excess > 0, axis=1))
     row, column = np.unravel_index(int(np.argmax(excess)), excess.shape)
     sensor, axis = where[column]
     events = 1 + int(np.count_nonzero(np.diff(rows) > SAME_EVENT))
@@ -120,28 +119,32 @@ def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
     excess = np.zeros_like(raw)
     if not np.isfinite(raw).all():
         return excess, where
-    step = np.abs(np.diff(raw, axis=0))
-    if not any(np.any(s > JUMP * _noise(s)) for s in step.T[:, :, None]):  # mostly the first column of a move
+    step = np.abs(raw[1:] - raw[:-1])
+    if not any((s > JUMP * _noise(s)).any() for s in step.T[:, :, None]):  # mostly the first column of a move
         return excess, where
     motion = _Motion(recording)
     values = np.concatenate([motion.unexplained(s, r) for s, r in found], axis=1)
-    change = {sensor: motion.change(sensor) for sensor, _ in found}
-    step = np.abs(np.diff(values, axis=0))
+    step = np.abs(values[1:] - values[:-1])
     noise = _noise(step)
     jump = step - JUMP * noise
-    for column in np.flatnonzero((jump > 0).any(axis=0)):
+    columns = np.flatnonzero((jump > 0).any(axis=0))
+    change = {sensor: motion.change(sensor) for sensor in dict.fromkeys(where[c][0] for c in columns)}
+    for column in columns:
         allowed = change[where[column][0]]
         jumps = np.flatnonzero(jump[:, column] > np.minimum(allowed[:-1], allowed[1:]))
-        usual = motion.scatter_of_rests(values[:, column]) if jumps.size else None
-        for n in np.unique(np.clip(np.concatenate([jumps, jumps + 1]), 0, recording.samples - 1)):  # on either side
+        usual, known = None, False
+        for n in np.unique(np.concatenate([jumps, jumps + 1])):  # on either side
             window, resting = motion.around(n)
             around = values[window, column]
-            middle = float(median(around))
+            away, least = abs(float(values[n, column] - median(around))), ALLOWED * float(allowed[n])
+            if away - MAX_DEVIATIONS * float(noise[column]) - least <= 0.0:
+                continue
+            if not known:
+                usual, known = motion.scatter_of_rests(values[:, column]), True
             scatter = usual if resting and usual is not None else _scatter(around)
             scatter = max(float(noise[column]), scatter)
-            off = abs(float(values[n, column]) - middle) - MAX_DEVIATIONS * scatter - ALLOWED * float(allowed[n])
-            excess[n, column] = max(off, 0.0)
-    return _widened(excess), where
+            excess[n, column] = max(away - MAX_DEVIATIONS * scatter - least, 0.0)
+    return (_widened(excess) if excess.any() else excess), where
 
 
 def _noise(step: Values) -> Values:
@@ -154,6 +157,10 @@ def _noise(step: Values) -> Values:
 
 def _scatter(values: Values) -> float:
     return MEDIAN_SIZE * float(median(np.abs(values - median(values))))
+
+
+def _length(vectors: Values) -> Values:
+    return np.abs(vectors[:, 0]) if vectors.shape[1] == 1 else np.linalg.norm(vectors, axis=1)
 
 
 def _widened(excess: Values) -> Values:
@@ -181,10 +188,9 @@ class _Motion:
         self.rate = rate
         self.still = STILL_BY_HAND_DEG if self.by_hand else STILL_DEG
         dt = recording.time_steps
-        turned = 0.5 * np.linalg.norm(rate[1:] + rate[:-1], axis=1) * dt
-        changed = np.linalg.norm(np.diff(rate, axis=0), axis=1)
-        speed = np.radians(np.linalg.norm(rate, axis=1))
-        pulled = (np.radians(changed) / dt + np.abs(np.diff(speed**2))) * LEVER_M / STANDARD_GRAVITY
+        turned, changed, speed = (_length(v) for v in (rate[1:] + rate[:-1], rate[1:] - rate[:-1], rate))
+        turned = 0.5 * turned * dt
+        pulled = (np.radians(changed) / dt + np.abs(np.diff(np.radians(speed) ** 2))) * LEVER_M / STANDARD_GRAVITY
         self.turned, self.changed, self.pulled = (np.append(0.0, np.cumsum(v)) for v in (turned, changed, pulled))
 
     def _rate(self) -> Values | None:
@@ -213,7 +219,7 @@ class _Motion:
         elif r.table_angle is not None:
             angle = np.radians(r.table_angle)[:, None]
             columns += [np.cos(angle), np.sin(angle)]
-        A = np.hstack(columns)
+        A = np.concatenate(columns, axis=1)
         if A.shape[1] == 1 or not np.isfinite(A).all():
             return reading
         return np.asarray(reading - A @ np.linalg.lstsq(A.T @ A, A.T @ reading, rcond=None)[0])
@@ -286,20 +292,20 @@ def _pieces(recording: Recording) -> Index:
         still = np.maximum(step, np.append(step[1:], 0.0)) < AT_REST_DPS * recording.interval
     else:
         return none
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
     size = max(MIN_PIECE_SAMPLES, round(PIECE_S / recording.interval))
-    out = []
     settling = int(np.ceil(SETTLING_S / recording.interval))
-    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        start, stop = begin + settling, end - settling
-        if stop - start < MIN_PIECE_SAMPLES:
-            continue
-        parts = -(-(stop - start) // size)
-        cuts = [start + (stop - start) * k // parts for k in range(parts + 1)]
-        whole = [begin, *cuts[1:-1], end]
-        spans = zip(itertools.pairwise(cuts), itertools.pairwise(whole), strict=True)
-        out += [(*inner, *outer) for inner, outer in spans if inner[1] - inner[0] >= MIN_PIECE_SAMPLES]
-    return np.array(out, np.intp).reshape(-1, 4)
+    padded = np.zeros(len(still) + 2, bool)
+    padded[1:-1] = still
+    rests = np.flatnonzero(padded[1:] != padded[:-1]).reshape(-1, 2)
+    rests = rests[rests[:, 1] - rests[:, 0] >= MIN_PIECE_SAMPLES + 2 * settling]
+    length = rests[:, 1] - rests[:, 0] - 2 * settling
+    parts = -(-length // size)
+    of = np.repeat(np.arange(len(rests)), parts)  # the rest of each piece
+    k = np.arange(len(of)) - (np.cumsum(parts) - parts)[of]
+    begin, end, length, parts = rests[of, 0], rests[of, 1], length[of], parts[of]
+    start, stop = (begin + settling + length * n // parts for n in (k, k + 1))
+    pieces = np.stack([start, stop, np.where(k == 0, begin, start), np.where(k + 1 == parts, end, stop)], axis=1)
+    return np.asarray(pieces[stop - start >= MIN_PIECE_SAMPLES], np.intp)
 
 
 def _excess(readings: Values, pieces: Index) -> tuple[Values, Values]:

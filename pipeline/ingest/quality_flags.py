@@ -285,8 +285,11 @@ def _stuck_rows(same: Mask, share: float) -> Index:
 
 def _in_a_row(same: Mask, count: int) -> bool:
     """Return whether ``count`` successive neighbours are equal."""
-    places, further = np.flatnonzero(same), count - 1
-    return len(places) > further and bool(np.any(places[further:] - places[: len(places) - further] == further))
+    further = count - 1
+    if np.count_nonzero(same) <= further:
+        return False
+    places = np.flatnonzero(same)
+    return bool(np.any(places[further:] - places[: len(places) - further] == further))
 
 
 def examine(table: Log, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[np.uint16] | None, list[Note]]:

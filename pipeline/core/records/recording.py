@@ -314,7 +314,8 @@ def median(values: Values, axis: int = 0, *, keepdims: bool = False) -> Values:
         ordered = np.moveaxis(ordered, axis, 0)
     one, two, last = ordered[half], ordered[half - 1 + size % 2], ordered[-1]
     middle = np.asarray(0.5 * (one + two))
-    if (unknown := np.isnan(last)).any():  # NaN is sorted last
+    unknown = np.isnan(last)  # NaN is sorted last
+    if unknown.any() if middle.ndim else unknown:
         middle = np.where(unknown, last, middle)
     return np.expand_dims(middle, axis) if keepdims else middle
 
