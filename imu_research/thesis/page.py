@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
 
@@ -149,7 +148,7 @@ def _before_and_after(results: Results, name: str, sensor: str) -> Figure | None
     drawn = held_out_over_time(f"held-out-{name}", sensor, held_out[0], before, after)
     means = [number(float(np.mean(np.abs(e)))) for e in (before, after)]
     finding = f"{_in_words(name)}: mean |e| goes from {means[0]} to {means[1]} {SENSOR_UNITS[sensor]}"
-    return replace(drawn, finding=finding, caption="Staged, as printed; below, after alone.")
+    return drawn._replace(finding=finding, caption="Staged, as printed; below, after alone.")
 
 
 def _in_words(name: str) -> str:

@@ -19,11 +19,10 @@ import math
 import re
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from html import escape
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -36,6 +35,7 @@ ANGLE_STEPS = (10.0, 15.0, 30.0, 45.0, 90.0, 180.0, 360.0, 720.0, 1800.0, 3600.0
 LINEAR_TO = 10.0  # value to which a symlog axis is linear: delta BIC of strong evidence
 
 Tick = tuple[float, str]
+Places = dict[tuple[int, int], tuple[Values, Integers]]  # of ``_placed``
 AXES_LEGEND = (("c0", "x"), ("c1", "y"), ("c2", "z"))
 CHART_WIDTH = 420  # px, of the drawing; the page scales it
 LEFT, RIGHT, TOP, BOTTOM, PANEL_GAP = 72, 14, 8, 36, 14  # px, margins of the panels and the gap between two
@@ -112,8 +112,7 @@ def _scaled(value: float, kind: str) -> float:
     return value / LINEAR_TO if size <= 1.0 else math.copysign(1.0 + math.log10(size), value)
 
 
-@dataclass(frozen=True)
-class Axis:
+class Axis(NamedTuple):
     """Maps values from ``low`` to ``high`` (on the scale of the axis) to pixels from ``start`` to ``stop``."""
 
     low: float
@@ -126,10 +125,15 @@ class Axis:
     def over(cls, arrays: Iterable[Values], start: float, stop: float, kind: str = "", margin: float = 0.04) -> Axis:
         """Return an axis over the finite values, wider by ``margin`` on both sides; 0 to 1 without any value."""
         values = scaled(np.concatenate([np.zeros(0), *(a.ravel() for a in arrays)]), kind)
-        values = values if np.isfinite(values).all() else values[np.isfinite(values)]
+        if values.size and not math.isfinite(float(values.max()) - float(values.min())):
+            values = values[np.isfinite(values)]
         if not values.size:
             return cls(0.0, 1.0, start, stop, kind)
-        low, high = float(values.min()), float(values.max())
+        return cls.around(float(values.min()), float(values.max()), start, stop, kind=kind, margin=margin)
+
+    @classmethod
+    def around(cls, low: float, high: float, start: float, stop: float, *, kind: str, margin: float) -> Axis:
+        """Return an axis over values from low to high, on the scale of the axis, wider by ``margin`` on both sides."""
         if high - low <= 1e-12 * max(abs(low), abs(high), 1e-300):
             half = 0.5 * abs(low) or 0.5
             return cls(low - half, high + half, start, stop, kind)
@@ -143,11 +147,18 @@ class Axis:
 
     def units(self, values: Values) -> Integers:
         """Return the positions of values in whole drawing units; values beyond the axis are drawn at its end."""
-        v = np.minimum(np.maximum(scaled(values, self.kind), self.low), self.high)
+        v = np.maximum(scaled(values, self.kind), self.low)
+        np.minimum(v, self.high, out=v)
         v -= self.low
         v *= SUBDIVISION * (self.stop - self.start) / (self.high - self.low)
         v += SUBDIVISION * self.start
         return np.asarray(np.rint(v, out=v).astype(np.int64))
+
+    def unit(self, value: float) -> int:
+        """Return ``units`` of one value, in a fifth of the time."""
+        v = min(max(_scaled(value, self.kind) if "log" in self.kind else value, self.low), self.high)
+        factor = SUBDIVISION * (self.stop - self.start) / (self.high - self.low)
+        return round((v - self.low) * factor + SUBDIVISION * self.start)
 
     def ticks(self, count: int, names: Sequence[str] = ()) -> list[Tick]:
         """Return at least two ticks as position (px) and text; ``names``: texts of the values 1, 2, ..."""
@@ -172,8 +183,7 @@ class Axis:
         return f' data-scale="{ends},{self.kind},{_escaped(label)}"{ticks}'
 
 
-@dataclass(frozen=True)
-class Figure:
+class Figure(NamedTuple):
     """The texts of a chart, and the chart once it is drawn.
 
     ``name``: identifier, unique on its page; ``finding``: the sentence above the chart, which states its result;
@@ -196,18 +206,18 @@ class Figure:
             f'{attributes}><title id="{name}-t">{escape(finding)}</title>'
             f'<desc id="{name}-d">{escape(typeset(description))}</desc>{content}</svg>'
         )
-        return replace(self, svg=svg, finding=finding, caption=typeset(self.caption))
+        return self._replace(svg=svg, finding=finding, caption=typeset(self.caption))
 
 
 def sentences(figure: str, **values: Any) -> tuple[str, str, str]:  # noqa: ANN401
     """Return the sentences of a chart by its macro in ``templates/figures.txt``: finding, caption, description."""
     text = str(getattr(template("figures.txt").module, figure)(**values))
-    finding, caption, *description = (re.sub(r"[ \n]+", " ", part).strip() for part in text.split("---\n"))
+    parts = (part.replace("\n", " ").split(" ") for part in text.split("---\n"))
+    finding, caption, *description = (" ".join(filter(None, words)).strip() for words in parts)
     return finding, caption, " ".join(description)
 
 
-@dataclass(frozen=True)
-class LineMark:
+class LineMark(NamedTuple):
     """Values joined by a line, broken where one is not finite; ``style``: "", ``dashed``, ``model`` or ``thick``."""
 
     x: Values
@@ -216,8 +226,7 @@ class LineMark:
     style: str = ""
 
 
-@dataclass(frozen=True)
-class SampleMarks:
+class SampleMarks(NamedTuple):
     """Samples in order, (n,) or (n, k) with a colour for each column, drawn as dots or as ranges of buckets.
 
     ``mean`` adds the line of the buckets' means, which shows slow changes below the noise.
@@ -229,8 +238,7 @@ class SampleMarks:
     mean: bool = False
 
 
-@dataclass(frozen=True)
-class Dots:
+class Dots(NamedTuple):
     """Separate values, with an upright interval ``low`` to ``high`` where it is given.
 
     ``units``: index of each value in the list of the chart's units, counted from 1, where it is not x.
@@ -244,8 +252,7 @@ class Dots:
     units: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
-class Area:
+class Area(NamedTuple):
     """The area between two curves, or over the whole axis x from one value to another."""
 
     low: Values | float
@@ -257,8 +264,7 @@ class Area:
 ChartLayer = LineMark | SampleMarks | Dots | Area
 
 
-@dataclass(frozen=True)
-class Panel:
+class Panel(NamedTuple):
     """One field of a chart: layers in the order in which they are drawn, and its axis y.
 
     ``height``: px; ``levels``: horizontal lines by their text; ``limits``: of the axis, by default from the layers;
@@ -298,8 +304,9 @@ def chart(
     x = Axis.over(values.values(), left, CHART_WIDTH - RIGHT, kind, margin)
     ticks = x.ticks(6, columns)
     parts, top = [], float(TOP)
+    places: Places = {}
     for panel in panels:
-        parts.append(_panel(panel, x, ticks, top))
+        parts.append(_panel(panel, x, ticks, top, places))
         top += panel.height + PANEL_GAP
     labels = "".join(text(at, top - PANEL_GAP + 13, label, "m") for at, label in ticks)
     parts.append(f'<g class="ticks">{labels}</g>')
@@ -320,20 +327,22 @@ def _escaped(content: str) -> str:
     return escape(typeset(content))
 
 
-def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
+def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float, places: Places) -> str:
     bottom = top + panel.height
     kind, margin = "log" if panel.logarithmic else "", 0.04 if panel.limits is None else 0.0
-    values = [np.array(panel.limits)]
-    if not panel.limits:
+    levels, limits = panel.levels or {}, panel.limits or ()
+    stated = [*limits, *levels.values()]
+    if limits and not kind and all(map(math.isfinite, stated)):
+        y = Axis.around(min(stated), max(stated), bottom, top, kind=kind, margin=margin)
+    else:
         heights = (getattr(layer, end, None) for layer in panel.layers for end in ("y", "low", "high"))
-        values = [np.asarray(v) for v in heights if v is not None]
-    levels = panel.levels or {}
-    y = Axis.over([*values, np.array([*levels.values()], float)], bottom, top, kind, margin)
+        values = [np.asarray(v) for v in heights if v is not None] if not limits else []
+        y = Axis.over([*values, np.array(stated, float)], bottom, top, kind, margin)
     ticks = y.ticks(max(3, panel.height // UPRIGHT), panel.rows)
-    grid = "".join(f"M{x.start:g} {at:.1f}H{x.stop:g}" for at, _ in ticks)
-    grid += "".join(f"M{at:.1f} {top:g}V{bottom:g}" for at, _ in x_ticks)
+    start, stop, height = f"M{x.start:g} ", f"H{x.stop:g}", f" {top:g}V{bottom:g}"
+    grid = "".join([f"{start}{at:.1f}{stop}" for at, _ in ticks] + [f"M{at:.1f}{height}" for at, _ in x_ticks])
     labels = "".join(text(x.start - 4, at + 3.5, label, "e") for at, label in ticks)
-    drawn = "".join(_draw(layer, x, y) for layer in panel.layers)
+    drawn = "".join([_draw(layer, x, y, places) for layer in panel.layers])
     names = _names(panel.names, x, y)
     for label, value in levels.items():
         at = y.pixels(value)
@@ -349,9 +358,9 @@ def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
     )
 
 
-def _draw(layer: ChartLayer, x: Axis, y: Axis) -> str:
+def _draw(layer: ChartLayer, x: Axis, y: Axis, places: Places) -> str:
     if isinstance(layer, Area) and layer.x is None:
-        low, high = y.units(np.array([layer.low, layer.high], float)).tolist()
+        low, high = y.unit(float(layer.low)), y.unit(float(layer.high))
         start, stop = int(SUBDIVISION * x.start), int(SUBDIVISION * x.stop)
         path = f"M{start} {low}l{stop - start} 0 0 {high - low} {start - stop} 0z"
         return f'<path class="band c{layer.colour}" d="{path}"/>'
@@ -361,36 +370,43 @@ def _draw(layer: ChartLayer, x: Axis, y: Axis) -> str:
         path = _line(np.concatenate([at, at[::-1]]), np.concatenate([low, high[::-1]]))
         return f'<path class="band c{layer.colour}" d="{path}z"/>'
     if isinstance(layer, SampleMarks):
-        return _samples(layer, layer.y if layer.y.ndim > 1 else layer.y[:, None], x, y)
-    known = np.flatnonzero(np.isfinite(layer.x) & np.isfinite(layer.y))
+        return _samples(layer, layer.y if layer.y.ndim > 1 else layer.y[:, None], x, y, places)
+    heights: tuple[Values | None, ...] = (layer.y,) if isinstance(layer, LineMark) else (layer.y, layer.low, layer.high)
+    values, known = np.array([v for v in heights if v is not None]), None
+    if np.isfinite(layer.x).all() and np.isfinite(layer.y).all():
+        at = _placed(layer.x, x, places)
+    else:
+        known = np.flatnonzero(np.isfinite(layer.x) & np.isfinite(layer.y))
+        at, values = x.units(layer.x[known]), values[:, known]
+    value, *ends = y.units(values)
     if isinstance(layer, LineMark):
-        path = _line(x.units(layer.x[known]), y.units(layer.y[known]), np.flatnonzero(np.diff(known) > 1) + 1)
+        path = _line(at, value, None if known is None else np.flatnonzero(np.diff(known) > 1) + 1)
         return f'<path class="line c{layer.colour} {layer.style}" d="{path}"/>'
-    at, path, room = x.units(layer.x[known]), "", LARGE_DOTS
-    value, *ends = y.units(np.array([v[known] for v in (layer.y, layer.low, layer.high) if v is not None]))
+    path, room = "", LARGE_DOTS
     if len(ends) == 2:
         path = f'<path class="strokes interval c{layer.colour}" d="{_path("M%d %dV%d", at, *ends)}"/>'
         room = LARGE_MEANS
     size = " large" * (len(layer.x) <= room)
-    units = f' data-units="{" ".join(str(layer.units[i]) for i in known)}"' if layer.units else ""
+    names = layer.units if known is None else [layer.units[i] for i in known] if layer.units else ()
+    units = f' data-units="{" ".join(map(str, names))}"' if layer.units else ""
     return f'{path}<path class="dots{size} c{layer.colour}" d="{_dots(at, value)}"{units}/>'
 
 
-def _samples(layer: SampleMarks, values: Values, x: Axis, y: Axis) -> str:
+def _samples(layer: SampleMarks, values: Values, x: Axis, y: Axis, places: Places) -> str:
     """Return columns of samples, (n, k), as dots, or as the ranges of buckets."""
     known_x, known_y = layer.x, values
     if not (np.isfinite(values).all() and np.isfinite(known_x).all()):
         known = np.isfinite(values) & np.isfinite(layer.x)[:, None]
         if (known != known[:, :1]).any():  # each column has samples of its own
             each = enumerate(values.T, layer.colour)
-            return "".join(_samples(replace(layer, colour=c), v[:, None], x, y) for c, v in each)
+            return "".join(_samples(layer._replace(colour=c), v[:, None], x, y, places) for c, v in each)
         known_x, known_y = layer.x[known[:, 0]], values[known[:, 0]]
     colours = range(layer.colour, layer.colour + values.shape[1])
     if len(known_x) <= MAXIMUM_DOTS:
-        at, dots = x.units(known_x), y.units(known_y.T)
+        at, dots = _placed(known_x, x, places), y.units(known_y.T)
         return "".join(f'<path class="dots c{c}" d="{_dots(at, v)}"/>' for c, v in zip(colours, dots, strict=True))
     start, count = _buckets(len(known_x), BUCKETS)
-    at = x.units(np.add.reduceat(known_x, start) / count)
+    at = _placed(known_x, x, places, BUCKETS)
     ends = [end.reduceat(known_y, start) for end in (np.minimum, np.maximum)]
     means = [np.add.reduceat(known_y, start) / count[:, None]] if layer.mean else []
     columns, full_of = y.units(np.array([*ends, *means])).transpose(2, 0, 1), _full(layer.x, values, y)
@@ -402,6 +418,16 @@ def _samples(layer: SampleMarks, values: Values, x: Axis, y: Axis) -> str:
     return "".join(out)
 
 
+def _placed(values: Values, x: Axis, places: Places, most: int = 0) -> Integers:
+    """Return ``units`` of finite values, or of the means of ``most`` buckets; once for all layers of a chart."""
+    if (id(values), most) not in places:
+        start, count = _buckets(len(values), most) if most else (None, None)
+        means = values if start is None else np.add.reduceat(values, start) / count
+        places[id(values), most] = values, x.units(means)  # with the values, whose identity no other array then gets
+    return places[id(values), most][1]
+
+
+@lru_cache(16)  # the recordings of many units are equally long
 def _buckets(samples: int, most: int) -> tuple[Integers, Integers]:
     """Return start and length of equal buckets; the last one also contains the remainder."""
     size = -(-samples // most)
@@ -416,20 +442,21 @@ def _full(x: Values, values: Values, axis: Axis) -> list[str]:
         of_x = np.may_share_memory(values, x)
         ends = [x[start, None]] * 2 if of_x else [end.reduceat(values, start) for end in (np.fmin, np.fmax)]
         values = np.stack(ends, 1).reshape(-1, values.shape[1])
-    share = (np.minimum(np.maximum(values, axis.low), axis.high) - axis.low) / (axis.high - axis.low)
-    numbers = np.where(np.isfinite(share), np.rint((2.0 * share - 1.0) * 32767.0), -32768.0).astype("<i2")
-    return [f' data-full="{b64encode(column.tobytes()).decode()}"' for column in numbers.T]
+    clipped = np.minimum(np.maximum(values.T, axis.low, order="C"), axis.high)
+    share = (clipped - axis.low) / (axis.high - axis.low)
+    numbers = np.where(np.isnan(share), -32768.0, np.rint((2.0 * share - 1.0) * 32767.0)).astype("<i2")
+    return [f' data-full="{b64encode(column.tobytes()).decode()}"' for column in numbers]
 
 
 def _line(x: Integers, y: Integers, breaks: Integers | None = None) -> str:
     """Return the path through points, written as differences; it begins again at ``breaks``."""
     if breaks is not None and breaks.size:
         ends = [0, *breaks.tolist(), len(x)]
+        if ends == [*range(0, len(x) + 1, 2)]:  # the chart of rests
+            return _path("M%d %dl%d %d", x[::2], y[::2], x[1::2] - x[::2], y[1::2] - y[::2])
         return "".join(_line(x[i:j], y[i:j]) for i, j in pairwise(ends))
     if len(x) < 2:
         return _dots(x, y)
-    if len(x) == 2:  # faster: a chart of rests has many of these
-        return f"M{x[0]} {y[0]}l{x[1] - x[0]} {y[1] - y[0]}"
     return f"M{x[0]} {y[0]}l{_path(' %d %d', x[1:] - x[:-1], y[1:] - y[:-1])[1:]}"
 
 

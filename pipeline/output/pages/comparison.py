@@ -336,7 +336,7 @@ def _figure(rows: Sequence[JSON], sentence: str, comparison: JSON, title: str, n
         return bars(figure, points, title)
     series = list(dict.fromkeys(p.series for p in points))
     legend = tuple((f"c{i % COLOURS}", s) for i, s in enumerate(series)) if len(series) > 1 else ()
-    return curves(replace(figure, legend=legend), points, title, x["label"], named=x["named"])
+    return curves(figure._replace(legend=legend), points, title, x["label"], named=x["named"])
 
 
 def _parameters(units: Mapping[str, pd.DataFrame], against: str, pairs: Mapping[str, str] | None) -> JSON:

@@ -8,8 +8,8 @@ levels (the noise floor) are lines across all rows. A row with an interval is th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,8 +36,7 @@ DECADE = 8.0  # largest over smallest x above which an axis x is logarithmic: th
 LOWEST = -100.0  # smallest value to which a bar on a symlog axis is drawn
 
 
-@dataclass(frozen=True)
-class Point:
+class Point(NamedTuple):
     """One value; None has no bar.
 
     ``interval``: low and high of a mean, drawn with the dot; ``units``: the values that are averaged; ``floor``:

@@ -316,7 +316,8 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
     sigma = np.hypot(white_noise(residual, noise), ((noise or {}).get("wander") or 0.0) if known else 0.0)
     every = slice(None, None, -(-len(x) // MODEL_POINTS))  # of the model, which has no noise, few points are enough
     layers: list[ChartLayer] = [SampleMarks(x, residual.reading)]
-    layers += [LineMark(x[every], residual.predicted[every, i], 5, "model") for i in range(3)]
+    at = x[every]
+    layers += [LineMark(at, residual.predicted[every, i], 5, "model") for i in range(3)]
     top = max(float(np.abs(residual.error).max()), 2.2 * float(sigma.max()))
     panels = [Panel(layers, f"reading, {unit}")]
     for i, axis in enumerate(AXES):
