@@ -318,8 +318,7 @@ class Design:
                 key = tuple(map(id, motions))
                 known[key] = known.get(key) or joined_motions(motions)
                 columns = columns_of_samples(term, sensor, known[key], K)
-            for c, place in enumerate(places):
-                A[:, place] = columns if term.layout() == Layout.EVERY_AXIS else columns[:, c]
+            A[:, places[0].start : places[2].stop] = columns.reshape(len(columns), -1)  # x, y, z follow each other
 
     def of_axis(self, c: int) -> Values:
         """Return the columns of one axis, the readings last: (n, q + 1) array."""

@@ -13,7 +13,7 @@ RSS   : ``y^T M y - y^T M Z (D^-2 + G)^-1 Z^T M y``; nu: readings less columns o
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple, TypeAlias
@@ -22,6 +22,7 @@ import numpy as np
 
 from pipeline.core.records import Index, Values
 from pipeline.estimation.engine import cholesky
+from pipeline.estimation.ranking import by_size
 
 Pick: TypeAlias = tuple[int, int]  # version and scale of an effect
 # log weight, (m,), mean and standard deviation, (m, k), of the normal components of a mixture
@@ -39,8 +40,7 @@ PRODUCT_ROUNDING = 1e-9  # of the largest eigenvalue: 1e7 times the rounding of 
 PRODUCT_RIDGE = 1e-12  # of a column's square: 1e4 times the rounding of a double
 
 
-@dataclass(frozen=True)
-class Version:
+class Version(NamedTuple):
     """The columns of an effect at one value of its nonlinear parameters."""
 
     columns: Index  # (k,), places among the products
@@ -63,7 +63,9 @@ class CandidateProblem:
     @cached_property
     def padded(self) -> Values:
         """The products with a last column of zeros, which stands for the missing columns of smaller sets."""
-        return np.pad(self.products, ((0, 0), (0, 1), (0, 1)))
+        padded: Values = np.zeros(np.add(self.products.shape, (0, 1, 1)))
+        padded[:, :-1, :-1] = self.products
+        return padded
 
     def rss(self, squares: Values) -> Values:
         """Return -nu/2 log RSS of sums of squares; if sigma has a lower bound, log L at its likeliest value."""
@@ -82,18 +84,17 @@ class CandidateProblem:
         return replace(self, products=self.products[kept], prior=self.prior[kept])
 
 
-def excited(products: Values, size: Values, limit: Values, least: float) -> Values | None:
-    """Return the linear map from columns to columns per limit of the parameters, in the excited directions.
+def excited(products: Values, size: Values, limit: Values, least: float) -> Iterator[Values | None]:
+    """Yield the linear map from columns to columns per limit of the parameters, in the excited directions.
 
-    ``products``: (k, k), with the base projected out. ``size``: (k,), norm of the columns before the projection.
-    ``least``: smallest share of that norm after the projection. None: all directions are excited, and the map is the
-    limits.
+    ``products``: (m, k, k) of m effects, with the base projected out. ``size``: (m, k), norm of the columns before the
+    projection. ``limit``: (m, k). ``least``: smallest share of that norm after the projection. None: all directions are
+    excited, and the map is the limits.
     """
-    values, vectors = np.linalg.eigh(products / (size[:, None] * size))
-    if values[0] > least**2:
-        return None
-    kept = vectors[:, values > least**2]
-    return np.asarray((kept @ kept.T) * limit / size[:, None] * size)
+    decomposed = np.linalg.eigh(products / (size[:, :, None] * size[:, None]))
+    for values, vectors, own, most in zip(*decomposed, size, limit, strict=True):
+        kept = vectors[:, values > least**2]
+        yield None if values[0] > least**2 else np.asarray((kept @ kept.T) * most / own[:, None] * own)
 
 
 def linear_problem(  # noqa: PLR0917  (they are the problem)
@@ -128,20 +129,23 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
         versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
     products[:, :, -1] += products @ values
     products[:, -1] += values @ products
-    unit, changes = np.ones(len(size)), []
+    unit = np.ones(len(size))
+    changes: dict[int, Values] = {}
     for name, _, at in columns:
-        inner = products[0, at, at]
         if name not in limits:
-            noise = np.sqrt(samples / np.maximum(np.diag(inner), 1e-300))
+            noise = np.sqrt(samples / np.maximum(np.diag(products[0])[at], 1e-300))
             limit = stated.get(name, noise)[: len(noise)]
             limits[name] = np.where(np.isfinite(limit), limit, noise)
-        change = excited(inner, size[at], limits[name], new)
-        if change is None:
-            unit[at] = limits[name]
-        else:
-            changes.append((at, change))
+        unit[at] = limits[name]
+    for members in by_size(at.stop - at.start for _, _, at in columns):
+        places = [columns[j][2] for j in members]
+        inner, sizes = np.stack([products[0, at, at] for at in places]), np.stack([size[at] for at in places])
+        found = excited(inner, sizes, np.stack([limits[columns[j][0]] for j in members]), new)
+        changes |= {j: change for j, change in zip(members, found, strict=True) if change is not None}
+    for j in changes:
+        unit[columns[j][2]] = 1.0
     scaled = products * (unit[:, None] * unit)
-    for at, change in changes:
+    for at, change in ((columns[j][2], changes[j]) for j in sorted(changes)):
         scaled[:, :, at] = scaled[:, :, at] @ change
         scaled[:, at] = change.T @ scaled[:, at]
     return CandidateProblem(scaled, prior, within, free, versions, limits, excluded, least)
@@ -174,11 +178,9 @@ class Given:
 
     def blocks(self, names: Sequence[str]) -> list[CandidateBlock]:
         """Return further effects, grouped by their number of columns."""
-        by_size: dict[int, list[str]] = {}
-        for name in names:
-            by_size.setdefault(len(self.problem.versions[name][0].columns), []).append(name)
         blocks, products = [], self.problem.padded
-        for members in by_size.values():
+        for index in by_size(len(self.problem.versions[name][0].columns) for name in names):
+            members = [names[j] for j in index]
             each = [self.problem.versions[name] for name in members]
             at = np.array([version.columns for versions in each for version in versions])
             half = self._half[..., at].transpose(0, 1, 3, 4, 2)
@@ -189,8 +191,8 @@ class Given:
             squares = self.squares[:, :, None] - gain
             weight = SCALE_PRIOR[:, None, None, None] + [v.log_weight for versions in each for v in versions]
             score = self.problem.rss(squares) - 0.5 * log_det + self.level[:, :, None] + weight
-            starts = np.cumsum([0, *(len(versions) for versions in each[:-1])])
-            blocks.append(CandidateBlock(members, starts, inner, cross, score, squares + self.problem.within))
+            owner = np.repeat(np.arange(len(each)), [len(versions) for versions in each])
+            blocks.append(CandidateBlock(members, owner, inner, cross, score, squares + self.problem.within))
         return blocks
 
 
@@ -207,7 +209,7 @@ class CandidateBlock:
     """Effects with equal numbers of columns, given s sets; their m versions follow each other."""
 
     names: list[str]
-    starts: Index  # of each effect's versions
+    owner: Index  # (m,), number of the effect of each version
     inner: Values  # (t, s, m, k, k), products of columns
     cross: Values  # (t, s, m, k), with the readings
     score: Values  # (scales, t, s, m), log E
@@ -218,15 +220,19 @@ class CandidateBlock:
         score, squares = self.score[:, kept], self.squares[:, kept]
         return replace(self, inner=self.inner[kept], cross=self.cross[kept], score=score, squares=squares)
 
+    @property
+    def starts(self) -> Index:
+        """The first version of each effect."""
+        return np.searchsorted(self.owner, np.arange(len(self.names)))
+
     @cached_property
     def conditionals(self) -> list[dict[str, Conditional]]:
         """Log E of each set with each effect."""
         scales, count = len(self.score), self.score.shape[3]
         evidence = log_sum(self.score, 1).transpose(1, 2, 0).reshape(self.score.shape[2], -1)
         first = scales * self.starts
-        owner = np.repeat(np.arange(len(first)), np.diff([*first, scales * count]))
         best = np.maximum.reduceat(evidence, first, axis=1)
-        above = evidence - best[:, owner]
+        above = evidence - best[:, np.repeat(self.owner, scales)]
         total = best + np.log(np.add.reduceat(np.exp(above), first, axis=1))
         places = np.where(above == 0.0, np.arange(scales * count), scales * count)
         rows = (each.tolist() for each in (total, best, np.minimum.reduceat(places, first, axis=1) - first))
@@ -239,8 +245,7 @@ class CandidateBlock:
         score, squares = self.score[:, :, number], self.squares[:, :, number]
         inner, cross = self.inner[:, number], self.cross[:, number]
         top = np.maximum.reduceat(np.max(score, axis=(0, 1)), self.starts)
-        owner = np.repeat(np.arange(len(self.names)), np.diff([*self.starts, score.shape[2]]))
-        kept = score > top[owner] + np.log(NEGLIGIBLE_MIXTURE_WEIGHT)
+        kept = score > top[self.owner] + np.log(NEGLIGIBLE_MIXTURE_WEIGHT)
         s, t, m = np.nonzero(kept)
         inverse = np.linalg.inv(inner[t, m] + LIMIT_SCALES[s, None, None] ** -2.0 * np.eye(inner.shape[-1]))
         mean, weight = (inverse @ cross[t, m, :, None])[..., 0], score[kept]
@@ -248,7 +253,7 @@ class CandidateBlock:
         deviation = np.sqrt(np.maximum(variance, 0.0))
         for j, name in enumerate(self.names):
             if name in names:
-                of_effect = owner[m] == j
+                of_effect = self.owner[m] == j
                 mixtures[name] = weight[of_effect], mean[of_effect], deviation[of_effect]
         return mixtures
 

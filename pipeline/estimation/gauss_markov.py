@@ -393,13 +393,15 @@ class Products:
 
     def products(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
         """Return ``A^T C^-1 A``, (g, p, p), and ``log det C`` of one channel, (g,), up to that of the weights."""
-        products, logarithm = np.repeat(self.white[None], len(settings), axis=0), np.zeros(len(settings))
-        wander = [g for g, setting in enumerate(settings) if setting.ratio > 0.0]
-        if wander:
-            model = self.blocks.model(tuple(settings[g] for g in wander))
+        products, logarithm = np.empty((len(settings), *self.white.shape)), np.zeros(len(settings))
+        wander = np.array([setting.ratio > 0.0 for setting in settings])
+        products[~wander] = self.white
+        if wander.any():
+            model = self.blocks.model(tuple(setting for setting in settings if setting.ratio > 0.0))
             # The difference comes first: in another order, rounding exceeds the remainder of collinear columns.
             within = self.white - self.means.T @ (self.blocks.weight[:, None] * self.means)
-            products[wander] = within + model.products(self.means)
+            between = model.products(self.means)
+            products[wander] = np.add(within, between, out=between)
             logarithm[wander] = model.log_determinant + np.sum(np.log(self.blocks.weight))
         return products, logarithm
 

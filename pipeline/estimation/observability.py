@@ -85,7 +85,8 @@ def one_way(observations: Observations) -> bool:
     for part in observations.parts:
         if part.motion.axis is not None and part.motion.rate is not None:
             rates = part.motion.rate[~part.motion.still]
-            signs.setdefault(part.motion.axis, set()).update(np.unique(np.sign(rates[rates != 0.0])).tolist())
+            found = [sign for sign in (-1.0, 1.0) if np.any(sign * rates > 0.0)]
+            signs.setdefault(part.motion.axis, set()).update(found)
     return _moving(observations) and not any(len(found) == 2 for found in signs.values())
 
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -71,8 +72,7 @@ MOST_FITS = 3  # of other timing effects
 LEAST_LAG_S = 1e-4  # a smaller lag has the column of a time offset, whose sign is free
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """One set: its log posterior, up to a constant, and the best versions and scales of its members."""
 
     score: float
@@ -415,16 +415,18 @@ def _fit(selection: Selection, names: Collection[str], candidates: Mapping[str, 
     return fit_terms(selection.observations, terms, selection.fit, selection.settings)
 
 
-def _versions(sensor: str, fit: JointFit, term: EffectColumns) -> list[tuple[EffectColumns, float]]:
-    """Return the terms of an effect and their prior log weights."""
-    fitted, place = placed(fit.terms).get(term.effect.name, (None, slice(0)))
+def _versions(
+    sensor: str, fit: JointFit, places: Mapping[str, tuple[EffectColumns, slice]], term: EffectColumns
+) -> list[tuple[EffectColumns, float]]:
+    """Return the terms of an effect and their prior log weights; ``places``: of the fitted terms."""
+    fitted, place = places.get(term.effect.name, (None, slice(0)))
     width = None
     if fitted is not None and term.effect.nonlinear:
         last = place.stop - 1
         width = float(np.sqrt(fit.covariance[last, last]) / max(abs(fitted.values[-1]), 1e-300))
     terms = time_constants(term.effect, sensor, fitted, width, between=bool(fit.terms))
     second = float(np.log(SECOND_SHARE)) if term.effect.name in SECOND[sensor] else 0.0
-    return [(replace(each, full=False, prior=term.prior), weight + second) for each, weight in terms]
+    return [(EffectColumns(each.effect, each.values, prior=term.prior), weight + second) for each, weight in terms]
 
 
 def _products(
@@ -454,7 +456,8 @@ def _problem(selection: Selection, fit: JointFit, candidates: Mapping[str, Effec
     observations = selection.observations
     configured = fit.terms[: len(selection.base.terms)]
     fitted = {t.effect.name: t.values for t in fit.terms[len(configured) :]}
-    versions = {name: _versions(observations.sensor, fit, candidate) for name, candidate in candidates.items()}
+    of_fit = observations.sensor, fit, placed(fit.terms)
+    versions = {name: _versions(*of_fit, candidate) for name, candidate in candidates.items()}
     listed = [(name, term, weight) for name, each in versions.items() for term, weight in each]
     known = BASE_COUNT + sum(len(term.values) for term in configured)
     size, base, products, logarithms, places = _products(selection, fit, listed, known)

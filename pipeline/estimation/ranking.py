@@ -97,7 +97,7 @@ class Ranking:
         size = np.where(self.sizes > 0, self.sizes, 1.0)[known:]
         unit = self.projected[0] / (size[:, None] * size)
         self.blocks: list[Values] = [np.zeros(0)] * len(self.spans)
-        for members in _by_size([span.stop - span.start for span in self.spans]):
+        for members in by_size([span.stop - span.start for span in self.spans]):
             decomposed = np.linalg.eigh(np.stack([unit[self.spans[j], self.spans[j]] for j in members]))
             for j, values, vectors in zip(members, *decomposed, strict=True):
                 kept = values > MIN_NEW_COLUMN_SHARE**2
@@ -110,18 +110,22 @@ class Ranking:
             return np.concatenate([*parts, columns[:, :, -1:]], axis=2)
 
         self.products: Values = reduced(reduced(self.projected).transpose(0, 2, 1))
+        self._excited: dict[str, list[int]] = {}
+        for j, term in enumerate(self.candidates):
+            if len(self.places[j]) > 0:
+                self._excited.setdefault(term.effect.name, []).append(j)
         self._with: dict[tuple[int, ...], Values] = {}  # log L of selected candidates and one more, from ``scores``
 
     def indices(self, name: str) -> list[int]:
         """Return the indices of the candidates of an effect that the motion excites."""
-        return [j for j, term in enumerate(self.candidates) if term.effect.name == name and len(self.places[j]) > 0]
+        return self._excited.get(name, [])
 
     def of_effects(self, names: Sequence[str]) -> list[int]:
         """Return the index of the first candidate of each effect, if possible of those that the motion excites.
 
         The motion may not excite an effect at its fitted value, for example at a time constant of many recordings.
         """
-        first = {term.effect.name: j for j, term in reversed([*enumerate(self.candidates)])}
+        first = {term.effect.name: j for j, term in reversed([*enumerate(self.candidates)])} if names else {}
         return [next(iter(self.indices(name)), first[name]) for name in names]
 
     def chosen(self, selected: Sequence[int]) -> Values:
@@ -157,7 +161,7 @@ class Ranking:
         names = {self.candidates[j].effect.name for j in selected}
         able = [j for j, term in enumerate(self.candidates) if len(self.places[j]) and term.effect.name not in names]
         scores = {}
-        for index in _by_size([self.blocks[j].shape for j in able]):
+        for index in by_size([self.blocks[j].shape for j in able]):
             members = [able[k] for k in index]
             for j, score, likelihoods in self._scored(members, products, before, limits):
                 scores[j], self._with[*selected, j] = score, likelihoods
@@ -233,7 +237,7 @@ class Ranking:
         """Return the decrease of the base's whitened sum of squares by each candidate, white noise: (c,) array."""
         products, found = self.products[0], np.zeros(len(self.places))
         definite = products + UNIT_COLUMN_RIDGE * np.eye(len(products))
-        for members in _by_size([len(at) for at in self.places]):
+        for members in by_size([len(at) for at in self.places]):
             at = np.stack([self.places[j] for j in members])
             cross = products[at, -1]
             solved = np.linalg.solve(definite[at[:, :, None], at[:, None]], cross[..., None])[..., 0]
@@ -247,7 +251,7 @@ class Ranking:
         return np.asarray(np.sum(limits[: squares.shape[1]] ** 2 * squares, axis=1))
 
 
-def _by_size(sizes: Iterable[Hashable]) -> Iterable[list[int]]:
+def by_size(sizes: Iterable[Hashable]) -> Iterable[list[int]]:
     """Return the indices of equal sizes, which are computed together."""
     found: dict[Hashable, list[int]] = {}
     for j, size in enumerate(sizes):

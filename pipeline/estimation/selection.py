@@ -82,22 +82,26 @@ def select(
             candidates[this.name] = EffectColumns(this, zeros, prior=prior)
         return starts, candidates
 
-    def searched(observations: Observations, near: Mapping[tuple[str, ...], JointFit]) -> Selection:
+    def searched(
+        observations: Observations,
+        given: tuple[list[list[EffectColumns]], dict[str, EffectColumns]],
+        near: Mapping[tuple[str, ...], JointFit],
+    ) -> Selection:
         """Select effects by all rows of the observations; ``near``: fits to most of them, from which fits start."""
-        starts, candidates = models(observations)
+        starts, candidates = given
         start, limits = ordinary_base(observations, noise), limits_of(observations.sensor, data_sheet)
         base = fit_best(observations, starts, start, grid)
         ranking = Ranking(observations, base, base, candidates, grid)
-        given = observations, noise, data_sheet, start, grid, limits, candidates
-        selection = Selection(*given, base, base, ranking, ranking, near=near)
+        problem = observations, noise, data_sheet, start, grid, limits, candidates
+        selection = Selection(*problem, base, base, ranking, ranking, near=near)
         if search:
             selection.run()
         return selection
 
     def selected() -> Selection:
-        selection = searched(observations, {})
-        remaining = without_unknown_motion(observations, selection.fit.terms)
-        return selection if remaining is observations else searched(remaining, {**selection.rough, **selection.fits})
+        selection = searched(observations, (starts, candidates), {})
+        remaining, near = without_unknown_motion(observations, selection.fit.terms), selection.rough | selection.fits
+        return selection if remaining is observations else searched(remaining, models(remaining), near)
 
     starts, candidates = models(observations)
     terms = [tuple(term.key for term in terms) for terms in ([*candidates.values()], *starts)]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError
-from pipeline.core.records import Index, Mask, Motion, Recording, Values
+from pipeline.core.records import Index, Mask, Motion, Recording, Values, median
 from pipeline.core.settings import Table
 from pipeline.estimation.engine import ResidualNoise, ScaledColumns
 from pipeline.estimation.gauss_markov import Blocks, WanderPrior
@@ -235,7 +235,7 @@ class RowGroups:
         kept = reading[self.kept]
         inside = np.ones(len(kept) - 1, bool)
         inside[self.first[1:] - 1] = False
-        white = np.median(np.diff(kept, axis=0)[inside] ** 2, axis=0) / MEDIAN_OF_DIFFERENCES
+        white = median(np.diff(kept, axis=0)[inside] ** 2) / MEDIAN_OF_DIFFERENCES
         deviation = (kept - np.repeat(self.means(reading), size, axis=0)) ** 2
         scatter = np.add.reduceat(deviation, self.first, axis=0)
         freedom = np.maximum(self.count - 1.0, 0.0)

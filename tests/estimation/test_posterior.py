@@ -178,7 +178,8 @@ def test_directions_without_excitation_are_left_out() -> None:
     column = np.random.default_rng(1).standard_normal((30, 1))
     Z = np.column_stack([column, column])  # only the sum of both parameters shows
     size = np.linalg.norm(Z, axis=0)
-    change = excited(Z.T @ Z, size, np.array([2.0, 2.0]), 1e-3)
+    (change,) = excited((Z.T @ Z)[None], size[None], np.array([[2.0, 2.0]]), 1e-3)
+    assert change is not None
     assert np.linalg.matrix_rank(Z @ change, tol=1e-9) == 1
     np.testing.assert_allclose(Z @ change, 2.0 * Z, atol=1e-12)
 

@@ -47,6 +47,7 @@ from pipeline.core.records import (
     SensorDiagnosis,
     SensorValidation,
     Values,
+    median,
 )
 from pipeline.core.settings import Effects, Settings, Table, Uncertainty
 from pipeline.core.verdicts import Verdict, decided_words
@@ -419,15 +420,15 @@ def effective_noise(
     for name in found.selected:
         of_effect = [(s.time, _of_effect(calibration, s, found, name)) for _, s in samples]
         if all(error is not None for _, error in of_effect):
-            of_effects[name] = of_effect
-    interval = errors[0][0].interval
+            of_effects[name] = [_about_mean(*error) for error in of_effect]
+    interval, of_all = errors[0][0].interval, [_about_mean(*error) for _, error in errors]
     white = float(np.sqrt(np.mean(noise.white**2) * interval))
     densities = []
     for time in dict.fromkeys(max(1, round(t / interval)) * interval for t in AVERAGING_TIMES_S):  # whole samples
-        density = _density([error for _, error in errors], time)
+        density = _density(of_all, time)
         if density is None:
             continue
-        shares = [{"effect": name, "density": _density(error, time)} for name, error in of_effects.items()]
+        shares = [{"effect": name, "density": _density(parts, time)} for name, parts in of_effects.items()]
         ratio = density / white if white > 0 else None
         entry = {"averaging_time_s": round(time, 9), "density": density, "over_white": ratio, "effects": shares}
         densities.append(entry)
@@ -455,18 +456,23 @@ def _of_effect(calibration: SensorCalibration, samples: Samples, found: SensorDi
     return np.asarray(linear_truth(calibration, calibration.bias + reading))
 
 
-def _density(parts: Sequence[tuple[Values, Values | None]], time: float) -> float | None:
-    """Return n_e from the times and errors of recordings; None for too few stretches or samples in a stretch."""
+def _about_mean(times: Values, error: Values | None) -> tuple[float, Values]:
+    """Return the interval of a recording's samples, and its known errors less their mean: (n, 3) array."""
+    if error is None or len(times) < 2:
+        return 1.0, np.zeros((0, 3))
+    values = error[np.isfinite(error).all(axis=1)]
+    return float(median(np.diff(times))), values - values.mean(axis=0) if len(values) else values
+
+
+def _density(parts: Sequence[tuple[float, Values]], time: float) -> float | None:
+    """Return n_e from ``_about_mean`` of recordings; None for too few stretches or samples in a stretch."""
     squares, count = 0.0, 0
-    for times, error in parts:
-        if error is None or len(times) < 2:
-            continue
-        size = round(time / float(np.median(np.diff(times))))
-        values = error[np.isfinite(error).all(axis=1)]
+    for interval, values in parts:
+        size = round(time / interval)
         stretches = len(values) // size if size else 0
         if not stretches:
             continue
-        means = (values - values.mean(axis=0))[: stretches * size].reshape(stretches, size, -1).mean(axis=1)
+        means = values[: stretches * size].reshape(stretches, size, -1).mean(axis=1)
         squares += float(np.sum(means**2)) / means.shape[1]
         count += stretches
     return float(np.sqrt(time * squares / count)) if count >= MIN_STRETCHES else None

@@ -281,7 +281,7 @@ class ProjectedCurves:
         for j in index:
             if rest[j, j] > (MIN_NEW_COLUMN_SHARE * self.size[j]) ** 2:
                 new.append(int(j))
-                rest -= np.outer(rest[:, j], rest[j]) / rest[j, j]
+                rest -= rest[:, j, None] * rest[j] / rest[j, j]
         return new
 
     def drop(self, index: ArrayLike) -> Values:

@@ -152,7 +152,10 @@ class Effect(abc.ABC):
 
     def of_the_room(self, sensor: str) -> bool:
         """Whether the effect depends on time and temperature only: it adds to the bias."""
-        return self.uses_time_or_temperature and self.fields(sensor, self.starts(sensor)[0]) <= OF_THE_ROOM
+        known: dict[str, bool] = vars(self).setdefault("_of_the_room", {})  # by sensor
+        if self.uses_time_or_temperature and sensor not in known:
+            known[sensor] = self.fields(sensor, self.starts(sensor)[0]) <= OF_THE_ROOM
+        return self.uses_time_or_temperature and known[sensor]
 
     def starts(self, sensor: str) -> list[Values]:
         """Return the values from which a fit starts; several where the reading is not linear in the parameters."""
