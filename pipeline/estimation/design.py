@@ -132,6 +132,8 @@ def motions_of(part: RecordingRows, terms: Terms) -> list[Motion]:
 
     A term with a slope by the motion of the base gets that.
     """
+    if not any(term.effect.moves and np.any(term.values) for term in terms):
+        return [part.motion] * (len(terms) + 1)
     everything = true_motion(part, terms)
     acting = [t.effect if t.effect.moves and np.any(t.values) and not t.effect.has_slope else None for t in terms]
     return [*(everything if own is None else true_motion(part, terms, own) for own in acting), everything]

@@ -311,9 +311,10 @@ class GaussMarkov:
         ordered = np.expand_dims(columns[self._order], 3 - axis)
         z = own * ordered
         z[1:] -= past * ordered[:-1]
-        rows, part = [*z], np.empty(z.shape[1:])
-        for before, row, factor in zip(rows, rows[1:], carried, strict=False):
-            np.subtract(row, np.multiply(factor, before, out=part), out=row)
+        rows, part = [*z.reshape(len(z), -1)], np.empty(z[0].size)
+        factors = np.broadcast_to(carried, z[1:].shape).reshape(len(carried), -1)  # faster than to broadcast each
+        for before, row, factor in zip(rows, rows[1:], factors, strict=False):
+            np.subtract(row, np.multiply(factor, before, part), row)
         return z.transpose(3 - axis, axis, 0)
 
     @cached_property

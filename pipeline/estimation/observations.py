@@ -263,25 +263,34 @@ def _part(recording: Recording, sensor: str, motion: Motion, *_: Same) -> Record
     if filtered:
         sure = _filter_settled(motion, recording) if sensor == "gyroscope" else reference_valid(motion)
         motion = replace(filtered_motion(_with_direction(motion), recording), reference_valid=sure)
-    valid = np.logical_and(np.all(np.isfinite(reading), axis=1), recording.valid)
-    rows = rows_of(motion, valid, together=not filtered)
+    x, y, z = np.isfinite(reading).T
+    valid = x & y & z & recording.valid
+    rows = rows_of(motion, valid, together=False) if filtered else _rows_at(recording, motion, valid.tobytes())
     at_rest = _as_at_rest(sensor, motion, reading, rows)
     rows = rows.settled(at_rest)
     if len(rows.first) == 0:
         return None
     independent = min(float(recording.filter.get("noise_gain", 1.0)) ** 2, 1.0)  # share of a filter's output
-    squares = (at_rest[rows.kept] - np.repeat(rows.means(at_rest), rows.count.astype(int), axis=0)) ** 2
+    means = rows.means(reading)
+    resting = means if at_rest is reading else rows.means(at_rest)
+    squares = (at_rest[rows.kept] - np.repeat(resting, rows.count.astype(int), axis=0)) ** 2
     by_angle = rate_by_angle(recording) if sensor == "gyroscope" and recording.axis is not None else None
     return RecordingRows(
         recording.name,
         rows.motion(motion) if filtered else _motion_at(recording, motion, rows),
-        rows.means(reading),
+        means,
         weight=rows.count * independent,
         scatter=np.sum(squares, axis=0) * independent,
         clock_shared=recording.clock_shared,
         interval=recording.interval,
         rounding=None if by_angle is None or not by_angle.noise.any() else rows.means(by_angle.noise**2),
     )
+
+
+@once_of_log
+def _rows_at(recording: Recording, motion: Motion, valid: bytes) -> RowGroups:  # noqa: ARG001  (which keeps the result)
+    """Return ``rows_of``, which are mostly the same for both sensors of a recording."""
+    return rows_of(motion, np.frombuffer(valid, bool))
 
 
 def _as_at_rest(sensor: str, motion: Motion, reading: Values, rows: RowGroups) -> Values:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -88,9 +88,17 @@ class Answers:
     sets: list[tuple[tuple[str, ...], float]]  # sets and their probability, the most probable first
     upper_limit: dict[str, Values]  # (k,), of the linear parameters of each effect
 
+    @cached_property
+    def _probabilities(self) -> dict[str, float]:
+        found: dict[str, float] = {}
+        for names, weight in self.sets:
+            for name in names:
+                found[name] = found.get(name, 0.0) + weight
+        return found
+
     def probability(self, name: str) -> float:
         """Return the probability that an effect is present."""
-        return float(sum(weight for names, weight in self.sets if name in names))
+        return self._probabilities.get(name, 0.0)
 
     def answer_set(self) -> list[tuple[tuple[str, ...], float]]:
         """Return the smallest number of sets with 95 % of the probability."""

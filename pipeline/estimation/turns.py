@@ -357,8 +357,8 @@ def _grouped(motion: Motion, kept: Index, together: bool) -> RowGroups:  # noqa:
     for deg, times in ((ROW_DEG, 1.0), (LONG_ROW_DEG, LONG_ROW_RATES)):
         changed = (speed - speed[begin]) / (times * step) + 0.5
         pieces = (time - time[begin]) / MEAN_S, (turned - turned[begin]) / deg, changed
-        piece = np.floor(np.stack(pieces, axis=1) + 1e-9)
-        first = np.flatnonzero(np.concatenate([[True], ~alike | np.any(np.diff(piece, axis=0) != 0, axis=1)]))
+        piece = np.floor(np.stack(pieces) + 1e-9)
+        first = np.flatnonzero(np.concatenate([[True], ~alike | np.any(np.diff(piece, axis=1) != 0, axis=0)]))
         if len(first) <= MANY_ROWS:
             break
     return RowGroups(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(motion.time))

@@ -14,8 +14,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from pipeline.core.records import (
     Answer,
     Candidate,
@@ -222,7 +220,7 @@ def _entry(findings: Findings, name: str) -> Candidate:
         delta_bic=score.delta_bic,
         p_value=score.p_value,
         parameters=estimates,
-        explained_share=float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0.0 else 0.0,
+        explained_share=min(max(drop / excess, 0.0), 1.0) if excess > 0.0 else 0.0,
         held_out_error_before=before,
         held_out_error_after=after,
         look_alikes={other: share for share, other in alike},

@@ -277,11 +277,12 @@ class ProjectedCurves:
 
     def independent(self, index: Iterable[int]) -> list[int]:
         """Return the curves of ``index`` that are independent of base, effects and the curves before them."""
-        rest, new = self.white.copy(), []
-        for j in index:
-            if rest[j, j] > (MIN_NEW_COLUMN_SHARE * self.size[j]) ** 2:
-                new.append(int(j))
-                rest -= rest[:, j, None] * rest[j] / rest[j, j]
+        tried, new = np.array([*index]), []
+        rest, least = self.white[tried[:, None], tried], (MIN_NEW_COLUMN_SHARE * self.size[tried]) ** 2
+        for k, j in enumerate(tried.tolist()):
+            if rest[k, k] > least[k]:
+                new.append(j)
+                rest -= rest[:, k, None] * rest[k] / rest[k, k]
         return new
 
     def drop(self, index: ArrayLike) -> Values:
