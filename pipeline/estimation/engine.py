@@ -197,15 +197,15 @@ def _within(weight: Values, sigma: Values, probability: float) -> Values:
     """
     quantile = float(scipy.special.ndtri(0.5 + probability / 2.0))
     sigma = np.maximum(sigma, 1e-9)
-    x: Values = quantile * sigma.min(axis=0)
+    x, largest = quantile * sigma.min(axis=0), quantile * sigma.max(axis=0)
     for _ in range(MAX_NEWTON_STEPS):
         ratio = x / sigma
         density = weight @ (np.exp(-0.5 * ratio**2) / sigma) * np.sqrt(2.0 / np.pi)
         step = (probability - weight @ (2.0 * scipy.special.ndtr(ratio) - 1.0)) / np.maximum(density, 1e-300)
-        x = np.minimum(x + step, quantile * sigma.max(axis=0))
-        if np.all(np.abs(step) <= SMALL_QUANTILE_STEP * x):
+        x = np.minimum(x + step, largest)
+        if (np.abs(step) <= SMALL_QUANTILE_STEP * x).all():
             break
-    return x
+    return np.asarray(x, np.float64)
 
 
 @cache

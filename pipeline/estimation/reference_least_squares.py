@@ -46,7 +46,7 @@ from pipeline.estimation.uncertainty_budget import (
     noise_contribution,
 )
 from pipeline.physics.effects import stated_priors
-from pipeline.physics.effects.base import truth
+from pipeline.physics.effects.base import length, truth
 from pipeline.physics.signal.filters import filtered
 
 NAME = "reference_least_squares"
@@ -75,8 +75,9 @@ def fit(task: StageInput, *, details: bool = True) -> SensorCalibration:
     first, root = (np.cumsum(count) - count).astype(np.intp), np.sqrt(count)[:, None]
     y, u = (np.add.reduceat(of_samples, first, axis=0) / count[:, None] for of_samples in (readings, truths))
     X = np.column_stack([np.ones(len(u)), u])
-    condition, rank = _require_observable(sensor, X, root), X.shape[1]
-    factors = ScaledColumns.of(root * X)
+    weighted = root * X
+    condition, rank = _require_observable(sensor, X, weighted), X.shape[1]
+    factors = ScaledColumns.of(weighted)
     beta = factors.solve(root * y)
     residuals = readings - beta[0] - truths @ beta[1:]
     bias, K = beta[0], beta[1:].T
@@ -103,7 +104,7 @@ def fit(task: StageInput, *, details: bool = True) -> SensorCalibration:
         residual_rms=float(np.sqrt(np.mean(residuals**2))),
         details=replace(figures, residual_rms=np.sqrt(np.mean(residuals**2, axis=0)).tolist()),
     )
-    convergence = linear_convergence(root * X, root * (y - X @ beta), condition, rank)
+    convergence = linear_convergence(weighted, root * (y - X @ beta), condition, rank)
     found = SensorCalibration(sensor, bias, matrix, stages=(*task.stages, result), convergence=convergence)
     if bench and not stated_priors(settings.table):  # else the stage ``effects`` fits them
         return fit_joint(sensor, recordings.filtered, bench, recordings.noises[sensor], settings, found)
@@ -139,14 +140,15 @@ def _reference(sensor: str, part: TurnPart) -> Values:
         return truth(sensor, late or motion)
 
 
-def _require_observable(sensor: str, X: Values, root: Values) -> float:
+def _require_observable(sensor: str, X: Values, weighted: Values) -> float:
     """Return the condition of the columns, in units of the largest motion; raise if one is not determined.
 
-    ``root``: (n, 1), of the samples of each row.
+    ``weighted``: (n, 4), X times the root of the samples of each row.
     """
-    size = float(np.max(np.linalg.norm(X[:, 1:], axis=1)))
-    units = np.linalg.norm(root) * np.array([1.0, size, size, size])
-    columns = ScaledColumns.of(root * X, MIN_DESIGN_SINGULAR_VALUE, units)
+    size = float(np.max(length(X[:, 1:])))
+    units = np.linalg.norm(weighted[:, 0]) * np.array([1.0, size, size, size])
+    triangle = np.asarray(np.linalg.qr(weighted / units, mode="r"), np.float64)  # of the same singular values
+    columns = ScaledColumns.of(triangle, MIN_DESIGN_SINGULAR_VALUE, np.ones(len(units)))
     if lost := columns.undetermined(PARAMETER_COLUMNS, PART_OF_IT):
         raise NotObservableError(
             f"{sensor}: the recordings do not determine {', '.join(lost)}"

@@ -74,7 +74,8 @@ class Reference:
             du = change(motion)
             if du is not None:
                 rows = fit.rows(slice(*edge))
-                for j in np.flatnonzero(du.any(axis=(0, 1))):  # those of other axes have no effect
+                size = np.ones(du[:, :, 0].size) @ np.abs(du).reshape(-1, inputs)
+                for j in np.flatnonzero(size):  # errors of other axes have no effect
                     total[:, j] += rows.of(du[:, :, j] @ self.K.T)
         return total
 

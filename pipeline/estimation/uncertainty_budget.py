@@ -139,8 +139,12 @@ def changes_on_table(
             columns = columns_of_samples(term, sensor, joined, K)
         else:
             columns = np.concatenate([term.regressors(sensor, motion, K) for motion in motions])
-        of_axes = [columns] * 3 if columns.ndim == 2 else columns.transpose(1, 0, 2)
-        each = [J[BASE] @ (A @ z) for J, A, z in zip(fit.derivative, fit.weights, of_axes, strict=True)]
+        if columns.ndim == 3:
+            fitted = [A @ z for A, z in zip(fit.weights, columns.transpose(1, 0, 2), strict=True)]
+        else:
+            alike = fit.weights[0] is fit.weights[1] is fit.weights[2]
+            fitted = [fit.weights[0] @ columns] * 3 if alike else [A @ columns for A in fit.weights]
+        each = [J[BASE] @ change for J, change in zip(fit.derivative, fitted, strict=True)]
         change = sum(each) if term.layout() == Layout.SHARED else np.concatenate(each, axis=1)
         full = np.zeros((BASE_COUNT, len(limits)))
         full[:, : change.shape[1]] = change

@@ -37,6 +37,7 @@ from pipeline.core.records import (
     continuous,
     cross,
     level_in_body,
+    median,
 )
 from pipeline.core.settings import Procedure
 from pipeline.estimation.design import EffectColumns
@@ -154,7 +155,7 @@ def drift(time: Values, estimate: Values, reference: Values, seconds: float) -> 
     """Return the error of an attitude (4, n) after a time of ``seconds``, root mean square over starts, deg."""
     last = int(np.searchsorted(time, time[-1] - seconds + 1e-6, "right")) - 1
     start = np.unique(np.linspace(0, max(last, 0), DRIFT_STARTS).astype(int))
-    interval = float(np.median(np.diff(time)))
+    interval = float(median(np.diff(time)))
     stop = np.minimum(np.searchsorted(time, time[start] + seconds - 0.5 * interval), len(time) - 1)
     turned, known = (_between(q[:, start], q[:, stop]) for q in (estimate, reference))
     return float(np.sqrt(np.mean(angle_between(turned, known) ** 2)))
@@ -180,7 +181,7 @@ def _fuse(time: Values, force: Values, alone: Values) -> tuple[Integers, Values]
     import imufusion  # noqa: PLC0415  (only units with a logged attitude need it)
 
     turns = angle_between(alone[:, :-1], alone[:, 1:])
-    interval, largest = float(np.median(np.diff(time))), max(float(turns.max()), 1e-9)
+    interval, largest = float(median(np.diff(time))), max(float(turns.max()), 1e-9)
     within = min(MAX_FILTER_STEP_S / interval, MAX_FILTER_STEP_DEG / largest)
     chosen = np.arange(0, len(time), max(1, int(within)))
     intervals = np.diff(time[chosen])

@@ -321,7 +321,7 @@ def linearized(calibration: SensorCalibration, samples: Samples) -> LinearizedSa
         return None
     vector, magnitude, _ = found
     chosen = samples.representative
-    truth = reference_vector(calibration, samples)[chosen]
+    truth = reference_vector(calibration, samples, chosen)
     along = truth / np.maximum(np.linalg.norm(truth, axis=1, keepdims=True), 1e-300)
     steps = calibration.parameters.standard_uncertainty.tolist()
     J = np.zeros((len(chosen), 3, len(steps)))

@@ -250,16 +250,17 @@ def _truth_of_other(reading: Values | None, calibration: SensorCalibration | Non
     return reading if reading is None or calibration is None else linear_truth(calibration, reading)
 
 
-def reference_vector(calibration: SensorCalibration, samples: Samples) -> Values:
-    """Return the reference's magnitude along its direction, else along the calibrated reading: (n, 3) array."""
-    reading = linear_truth(calibration, samples.reading)
-    direction = reading
+def reference_vector(calibration: SensorCalibration, samples: Samples, at: Mask | Index) -> Values:
+    """Return the reference's magnitude along its direction, else along the calibrated reading, at n samples: (n, 3)."""
+    direction = np.full((len(samples.time), 3), np.nan)[at]
     if samples.motion is not None:
-        reference = truth(samples.sensor, samples.motion)
-        direction = np.where(np.isfinite(reference).all(axis=1, keepdims=True), reference, reading)
+        direction = truth(samples.sensor, samples.motion)[at]
+    if (unknown := ~np.isfinite(direction).all(axis=1)).any():
+        direction = np.where(unknown[:, None], linear_truth(calibration, samples.reading[at]), direction)
     size = length(direction)[:, None]
-    unit = np.where(size > 0, direction / np.where(size > 0, size, 1.0), [1.0, 0.0, 0.0])
-    return np.asarray(samples.magnitude[:, None] * unit)
+    if not np.all(size > 0):
+        direction, size = np.where(size > 0, direction, [1.0, 0.0, 0.0]), np.where(size > 0, size, 1.0)
+    return np.asarray(samples.magnitude[at, None] * (direction / size))
 
 
 def _creep(recording: Recording, rests: Sequence[Rest], force: Values) -> tuple[Values, Values]:

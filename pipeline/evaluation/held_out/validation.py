@@ -311,7 +311,7 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
 
 def noise_floor(calibration: SensorCalibration, samples: Sequence[Samples]) -> float:
     """Return the rms error by noise alone."""
-    known = [(reference_vector(calibration, s)[s.known], s.variance[s.known]) for s in samples]
+    known = [(reference_vector(calibration, s, s.known), s.variance[s.known]) for s in samples]
     squares = [squared_norm_errors(truth, calibration.matrix, variance) for truth, variance in known]
     return float(np.sqrt(np.mean(np.concatenate(squares))))
 
@@ -460,10 +460,11 @@ def _fitted(calibration: SensorCalibration, part: str, left: Values, truth: Valu
         change = change[np.isfinite(change).all(axis=1)]
         return calibration.bias + np.mean(change @ K.T, axis=0), matrix
     known = np.isfinite(left + truth).all(axis=1)
-    left, truth = left[known], truth[known]
+    if not known.all():
+        left, truth = left[known], truth[known]
     reading = left @ K.T  # minus the bias
-    ones, off = np.ones((len(reading), 1)), reading - reading.mean(axis=0)
-    if part == "none" or np.linalg.eigvalsh(off.T @ off)[0] < LEAST_SPREAD_G**2 * len(reading):
+    ones = np.ones((len(reading), 1))
+    if part == "none" or _spread(reading) < LEAST_SPREAD_G:
         offset = np.mean(truth - reading @ matrix.T, axis=0)
     elif part == "full":
         *rows, offset = np.linalg.lstsq(np.hstack([reading, ones]), truth, rcond=None)[0]
@@ -472,3 +473,9 @@ def _fitted(calibration: SensorCalibration, part: str, left: Values, truth: Valu
         pairs = [np.linalg.lstsq(np.hstack([reading[:, [i]], ones]), truth[:, i], rcond=None)[0] for i in range(3)]
         matrix, offset = np.diag([p[0] for p in pairs]), np.array([p[1] for p in pairs])
     return calibration.bias - np.linalg.solve(matrix, offset), matrix
+
+
+def _spread(values: Values) -> float:
+    """Return the least rms deviation of (n, 3) values from their mean along any direction."""
+    off = values - values.mean(axis=0)
+    return float(np.sqrt(max(np.linalg.eigvalsh(off.T @ off)[0], 0.0) / len(off)))

@@ -147,18 +147,16 @@ class TableAxisNonorthogonality(_OfTurns):
 
     def in_turn(self, sensor: str, motion: Motion, axis: int, K: Values) -> tuple[Values, ...]:
         """Return the columns of the lean along the next axis and along the one after it."""
-        assert motion.level is not None  # noqa: S101
         assert motion.rate is not None  # noqa: S101
+        leans = [np.radians(np.eye(3)[(axis + step) % 3]) for step in (1, 2)]
+        if sensor == "gyroscope":
+            return tuple(motion.rate[:, None] * (K @ lean) for lean in leans)
+        assert motion.level is not None  # noqa: S101
         assert motion.angle is not None  # noqa: S101
         upright = abs(motion.level[0, 2, axis]) > VERTICAL_SINE
         up = motion.level[0, 2] if upright else UP_AT_ZERO[axis]
         f, columns = motion.specific_force, []
-        for step in (1, 2):
-            lean = np.zeros(3)
-            lean[(axis + step) % 3] = np.radians(1.0)
-            if sensor == "gyroscope":
-                columns.append(motion.rate[:, None] * (K @ lean))
-                continue
+        for lean in leans:
             across = skew(ABOUT[axis] @ lean)  # across @ u = theta x u
             home = turn_about_axis(across @ up, axis, -motion.angle)
             columns.append((f @ across.T - length(f)[:, None] * home) @ K.T)
