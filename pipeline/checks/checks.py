@@ -38,7 +38,7 @@ from pipeline.checks.at_rest import check_axes, check_static, with_rates_at_rest
 from pipeline.checks.evidence import place, refusal
 from pipeline.checks.mounting import check_mounting
 from pipeline.checks.reference import check_motion, check_turns
-from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Mask, Note, Recording, Values
+from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Note, Recording, Values
 from pipeline.core.settings import Settings, Table
 from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.physics.kinematics import normal_gravity_g
@@ -62,7 +62,7 @@ RESOLUTION_NOTE = "N-RESOLUTION"
 SAME_STEP = 1e-6  # relative: rounding of a difference of decimals
 MAX_SIGNIFICANT_DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
 SAME_GRAVITY_G = 1e-4  # gravity changes by as much over 0.3 km of height
-TENFOLD = np.asarray(10.0 ** np.arange(1, MAX_SIGNIFICANT_DIGITS)[:, None, None], np.float64)
+TENFOLD = 10.0 ** np.arange(1, MAX_SIGNIFICANT_DIGITS)[:, None, None]
 FIRST_OF_DECIMALS = 8  # of them, which exclude most numbers of decimals
 OF_DECIMALS = 200  # samples that determine the decimals: a finer reading ends in a zero in a tenth of them
 MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
@@ -294,16 +294,12 @@ def _decimals(recording: Recording) -> tuple[int, ...]:
         reading = recording.reading(sensor)
         part = np.zeros((0, 3)) if reading is None else reading[:OF_DECIMALS]
         part = part[np.isfinite(part).all(axis=1)]
-        possible = _are_exact(part[:FIRST_OF_DECIMALS], TENFOLD) & bool(part.size)
-        exact = (1 + k for k in np.flatnonzero(possible).tolist() if _are_exact(part, TENFOLD[k : k + 1]).all())
-        decimals.append(next(exact, MAX_SIGNIFICANT_DIGITS))
+        possible = np.arange(1, MAX_SIGNIFICANT_DIGITS)
+        for rows in (part[:FIRST_OF_DECIMALS], part):
+            off = np.abs(rows - np.rint(rows * TENFOLD[possible - 1]) / TENFOLD[possible - 1])
+            possible = possible[np.all(off < 10.0**-MAX_SIGNIFICANT_DIGITS, axis=(1, 2))]
+        decimals.append(int(possible[0]) if possible.size and part.size else MAX_SIGNIFICANT_DIGITS)
     return tuple(decimals)
-
-
-def _are_exact(readings: Values, tenfold: Values) -> Mask:
-    """Return with which numbers of decimals the readings are written completely."""
-    off = np.abs(readings - np.rint(readings * tenfold) / tenfold)
-    return np.asarray((off < 10.0**-MAX_SIGNIFICANT_DIGITS).all(axis=(1, 2)))
 
 
 def _check_at(recordings: Sequence[Recording], decimals: Sequence[int]) -> None:

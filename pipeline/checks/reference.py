@@ -105,7 +105,6 @@ class ChannelComparison:
         self.recording, self.channels, self.limits = recording, channels, limits
         self.dt = recording.time_steps
         self.interval = float(median(self.dt))
-        self._parts: dict[str, tuple[Values, Values]] = {}  # by channel
         self._summed: dict[tuple[str, int], tuple[Values, Values, Values, Values]] = {}  # by channel and size
         self.known = np.ones(len(self.dt), bool)  # intervals in which every channel is known
         for channel in channels:
@@ -118,12 +117,11 @@ class ChannelComparison:
         if not others or claim.name in OF_SENSOR:
             return None
         alone = all(w.name in OF_SENSOR for w in others)
-        rows: list[tuple[Values, Values]] = []
-        least, doubtful = np.full(len(claim.low), np.inf), True
+        rows: list[tuple[Values, Values]] = []  # effects allow at least what the stated accuracy allows
+        doubtful = True
         while len(rows) < len(others) and doubtful:
             rows.append(self._rows(claim, others[len(rows)], alone=alone))
-            least = np.minimum(least, rows[-1][1])
-            doubtful = bool((least > 0.0).any())  # effects allow at least what the stated accuracy allows
+            doubtful = bool((np.min([doubt for _, doubt in rows], axis=0) > 0.0).any())
         gross, doubt = zip(*rows, strict=True)
         contradiction = (doubtful and self._worst_row(claim, others, gross)) or self._worst_stretch(claim, others)
         found = contradiction or (doubtful and self._worst_row(claim, others, doubt))
@@ -218,18 +216,13 @@ class ChannelComparison:
         """Return for each stretch: angle, sum of its magnitudes, squared error by bends, and range of the rate."""
         if (channel.name, size) in self._summed:
             return self._summed[channel.name, size]
-        if channel.name not in self._parts:
-            each = np.zeros((3, len(self.dt)))
-            each[0] = np.where(self.known, channel.turned, 0.0)
-            np.abs(each[0], out=each[1])
-            if not channel.of_intervals:
-                steps = np.diff(np.where(np.isfinite(channel.low), channel.low, 0.0))
-                each[2] = (np.where(self.known, 0.5 * steps, 0.0) * self.dt) ** 2
-            rate = np.where(self.known, channel.low if channel.of_intervals else channel.low[1:], 0.0)
-            self._parts[channel.name] = each, rate
-        each, rate = self._parts[channel.name]
-        angle, total, bends = np.add.reduceat(each, starts, axis=1)
+        turned, bend = np.where(self.known, channel.turned, 0.0), np.zeros(len(self.dt))
+        rate = np.where(self.known, channel.low if channel.of_intervals else channel.low[1:], 0.0)
+        if not channel.of_intervals:
+            steps = np.diff(np.where(np.isfinite(channel.low), channel.low, 0.0))
+            bend = (np.where(self.known, 0.5 * steps, 0.0) * self.dt) ** 2
         swing = np.maximum.reduceat(rate, starts) - np.minimum.reduceat(rate, starts)
+        angle, total, bends = (np.add.reduceat(v, starts) for v in (turned, np.abs(turned), bend))
         self._summed[channel.name, size] = angle, total, bends, swing
         return angle, total, bends, swing
 
@@ -474,10 +467,7 @@ def _delay_of(recording: Recording, channels: Sequence[Channel], limits: Channel
         power = min(float(one @ one), float(two @ two)) / len(one)
         if float(squares.min()) >= BETTER * power:
             continue  # nothing moves, or they are not alike at any delay
-        open_to = _possible(squares, steps)
-        if open_to[furthest] and not of_sensor:
-            continue  # no delay is possible
-        interval = _interval(squares, open_to, NEARLY * power)
+        interval = _interval(squares, NEARLY * power, steps, unless=None if of_sensor else furthest)
         if interval is None:
             continue
         best, low, high = ((d - furthest) * step for d in interval)
@@ -493,10 +483,7 @@ def _delay_of(recording: Recording, channels: Sequence[Channel], limits: Channel
 
 
 def _variances(fixed: Values, moved: Values) -> Values:
-    """Return the variance of the difference between (n,) values and each n successive ones of (m,): (m - n + 1,).
-
-    ``moved``: values of mean 0, so that the sums of their squares lose no digits.
-    """
+    """Return the variance of (n,) values minus each n successive ones of (m,) values of mean 0: (m - n + 1,) array."""
     n, one = len(fixed), fixed - fixed.mean()
     end, power = len(moved) - n, one @ one
     total, squares = (np.cumsum(np.append(v[:n].sum(), v[n:] - v[:end])) for v in (moved, moved * moved))
@@ -555,22 +542,18 @@ def _thinned(first: Channel, other: Channel, recording: Recording) -> tuple[floa
     return size * recording.interval, one, two
 
 
-def _possible(squares: Values, steps: int) -> Mask:
-    """Return which of the delays tried the steps do not exclude."""
+def _interval(squares: Values, room: float, steps: int, unless: int | None = None) -> tuple[float, float, float] | None:
+    """Return the index of the minimum, and of the first and the last delay that the steps do not exclude.
+
+    None if they exclude neither the first nor the last of all delays tried, or not the delay ``unless``.
+    """
     least = max(float(squares.min()), float(np.finfo(float).tiny))
     over = np.log(np.maximum(squares, least)) - np.log(least)  # their quotient may exceed the largest number
-    return np.asarray(steps * over <= SURE_END_DEVIATIONS * np.sqrt(2.0 * len(squares)))
-
-
-def _interval(squares: Values, open_to: Mask, room: float) -> tuple[float, float, float] | None:
-    """Return the index of the minimum, and of the first and the last delay that is possible.
-
-    None if neither the first nor the last of all delays tried is excluded.
-    """
-    if open_to[0] and open_to[-1]:
+    open_to = np.flatnonzero(steps * over <= SURE_END_DEVIATIONS * np.sqrt(2.0 * len(squares)))
+    if (open_to[0] == 0 and open_to[-1] == len(squares) - 1) or unless in open_to:
         return None
-    best, possible = _nearest_minimum(squares, room), np.flatnonzero(open_to)
-    return best, min(best, float(possible[0])), max(best, float(possible[-1]))
+    best = _nearest_minimum(squares, room)
+    return best, min(best, float(open_to[0])), max(best, float(open_to[-1]))
 
 
 def _nearest_minimum(squares: Values, room: float) -> float:

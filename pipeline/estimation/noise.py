@@ -48,6 +48,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import scipy
@@ -373,16 +374,21 @@ def _likelihood(blocks: _RestBlocks, design: Values, covariance: Values, times: 
     nu = max(float(np.sum(blocks.count - 1)) * correlated, 1e-9)
     cut = blocks.cut
     cut_blocks = Blocks(np.arange(cut.sum()), 1.0 / v[cut], blocks.start[cut], blocks.length[cut], blocks.clock[cut])
-    settings = [Setting(ratio, tau) for tau in times.tolist() for ratio in SQRT_Q_GRID.tolist()]
+    settings = _grid(*times.tolist())
     basis = orthonormal(design, v[cut], MIN_NUISANCE_SINGULAR_VALUE)
     log_determinant, squares = GaussMarkov(cut_blocks, settings).restricted(basis, blocks.mean[cut])
-    inner = [np.sum(blocks.count * (1.0 - variance_of_average(blocks.length, tau))) for tau in times]
+    inner = np.sum(blocks.count * (1.0 - variance_of_average(blocks.length, times[:, None])), axis=1)
     expected = within + np.outer(inner, SQRT_Q_GRID**2).ravel()
     free = len(cut_blocks.weight) - basis.shape[1] + nu
     variance = np.maximum((squares + nu * blocks.scatter / expected[:, None]) / free, 1e-18)
     log_likelihood = -0.5 * ((log_determinant + nu * np.log(expected))[:, None] + free * np.log(variance))
     shape = (len(times), len(SQRT_Q_GRID), -1)
     return log_likelihood.reshape(shape), np.sqrt(variance).reshape(shape)
+
+
+@lru_cache(maxsize=8)  # sensor models of a batch
+def _grid(*times: float) -> tuple[Setting, ...]:
+    return tuple(Setting(ratio, tau) for tau in times for ratio in SQRT_Q_GRID.tolist())
 
 
 def noise_of(sensor: str, recordings: Sequence[Recording], data_sheet: DataSheet) -> Noise | None:

@@ -159,10 +159,6 @@ def _scatter(values: Values) -> float:
     return MEDIAN_SIZE * float(median(np.abs(values - median(values))))
 
 
-def _length(vectors: Values) -> Values:
-    return np.abs(vectors[:, 0]) if vectors.shape[1] == 1 else np.linalg.norm(vectors, axis=1)
-
-
 def _widened(excess: Values) -> Values:
     rows = np.flatnonzero(np.any(excess > 0, axis=1))
     for event in [] if not rows.size else np.split(rows, np.flatnonzero(np.diff(rows) > SAME_EVENT) + 1):
@@ -188,8 +184,9 @@ class _Motion:
         self.rate = rate
         self.still = STILL_BY_HAND_DEG if self.by_hand else STILL_DEG
         dt = recording.time_steps
-        turned, changed, speed = (_length(v) for v in (rate[1:] + rate[:-1], rate[1:] - rate[:-1], rate))
-        turned = 0.5 * turned * dt
+        turned = 0.5 * np.linalg.norm(rate[1:] + rate[:-1], axis=1) * dt
+        changed = np.linalg.norm(rate[1:] - rate[:-1], axis=1)
+        speed = np.linalg.norm(rate, axis=1)
         pulled = (np.radians(changed) / dt + np.abs(np.diff(np.radians(speed) ** 2))) * LEVER_M / STANDARD_GRAVITY
         self.turned, self.changed, self.pulled = (np.append(0.0, np.cumsum(v)) for v in (turned, changed, pulled))
 

@@ -285,10 +285,9 @@ def _stuck_rows(same: Mask, share: float) -> Index:
 
 def _in_a_row(same: Mask, count: int) -> bool:
     """Return whether ``count`` successive neighbours are equal."""
-    further = count - 1
-    if np.count_nonzero(same) <= further:
+    if np.count_nonzero(same) < count:
         return False
-    places = np.flatnonzero(same)
+    places, further = np.flatnonzero(same), count - 1
     return bool(np.any(places[further:] - places[: len(places) - further] == further))
 
 

@@ -309,15 +309,13 @@ def noise_of_steps(step: Values, axis: int = 0, *, keepdims: bool = False) -> Va
 def median(values: Values, axis: int = 0, *, keepdims: bool = False) -> Values:
     """Return the median along an axis; of a thousand values and fewer 2 to 3 times as fast as ``numpy.median``."""
     half, size = values.shape[axis] // 2, values.shape[axis]
-    ordered = np.partition(values, (half - 1, half, size - 1), axis)
-    if axis:
-        ordered = np.moveaxis(ordered, axis, 0)
-    one, two, last = ordered[half], ordered[half - 1 + size % 2], ordered[-1]
+    ordered, before = np.partition(values, (half - 1, half, size - 1), axis), (slice(None),) * (axis % values.ndim)
+    one, two, last = (ordered[(*before, place)] for place in (half, half - 1 + size % 2, -1))
     middle = np.asarray(0.5 * (one + two))
     unknown = np.isnan(last)  # NaN is sorted last
     if unknown.any() if middle.ndim else unknown:
         middle = np.where(unknown, last, middle)
-    return np.expand_dims(middle, axis) if keepdims else middle
+    return middle[(*before, None)] if keepdims else middle
 
 
 class _Deferred:
