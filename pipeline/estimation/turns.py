@@ -106,7 +106,7 @@ def stop_and_go(motion: Motion) -> bool:
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(motion.specific_force, axis=0)])
     start, stop = np.array(rests).T
     means = (total[stop] - total[start]) / (stop - start)[:, None]
-    return len(np.unique(np.round(means / DISTINCT_DIRECTION_G), axis=0)) >= 4
+    return len({tuple(mean) for mean in np.round(means / DISTINCT_DIRECTION_G).tolist()}) >= 4
 
 
 def settled(part: TurnPart) -> Mask:

@@ -205,6 +205,16 @@ def test_the_result_is_the_same_every_time_and_survives_its_file() -> None:
     assert list(first.stages[0].parameters) == list(first.parameters.names)
 
 
+def test_a_fit_without_details_has_the_same_matrix_covariance_and_degrees_of_freedom() -> None:
+    recordings = Bench(**GYROSCOPE, white=0.05, wander_size=0.003).turns_at([60.0])
+    task = StageInput("gyroscope", UnitRecordings(recordings, {"gyroscope": None}), None, settings())
+    whole, alone = fit(task), fit(task, details=False)
+    assert np.array_equal(alone.matrix, whole.matrix)
+    assert np.array_equal(alone.covariance, whole.covariance)
+    assert np.array_equal(alone.parameters.degrees_of_freedom, whole.parameters.degrees_of_freedom)
+    assert [line.source for line in alone.lines] == [line.source for line in whole.lines]
+
+
 def test_the_covariance_of_the_matrix_is_that_of_its_inverse_by_simulation() -> None:
     errors, stated = [], []
     for seed in range(100):

@@ -37,6 +37,7 @@ def fit(
         found = fit_stage(sensor, stage, recordings, previous, settings)
         if not last or stage == GIVEN:  # it would be counted twice; a given calibration states its own uncertainty
             return found
-        return with_stated(found, recordings, settings, rate_error(recordings.filtered, settings.table))
+        off = rate_error(recordings.filtered, settings.table) if sensor == "gyroscope" else 0.0
+        return with_stated(found, recordings, settings, off)
     except CannotCalibrateError as reason:
         return NotCalibrated(reason.message)

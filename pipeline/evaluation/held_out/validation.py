@@ -280,8 +280,9 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
             return None
         reading, truth = found[0], found[2]
         known = samples.known & np.isfinite(np.hstack([reading, truth])).all(axis=1)
-        rows = np.isfinite(truth[samples.representative]).all(axis=1)
-        columns = np.column_stack([np.ones(np.count_nonzero(rows)), truth[samples.representative][rows]])
+        chosen = truth[samples.representative]
+        rows = np.isfinite(chosen).all(axis=1)
+        columns = np.column_stack([np.ones(np.count_nonzero(rows)), chosen[rows]])
         products = columns.T @ part.derivative[rows].reshape(len(columns), -1)
         per_parameter = (np.linalg.pinv(columns.T @ columns, hermitian=True) @ products)[1:].reshape(3, 3, -1)
         slopes += part.number * per_parameter.swapaxes(0, 1).reshape(9, -1)
