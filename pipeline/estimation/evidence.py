@@ -127,8 +127,9 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
         if name in fitted and name not in versions:
             values[at] = fitted[name][: at.stop - at.start]
         versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
-    products[:, :, -1] += products @ values
-    products[:, -1] += values @ products
+    if fitted:
+        products[:, :, -1] += products @ values
+        products[:, -1] += values @ products
     unit = np.ones(len(size))
     changes: dict[int, Values] = {}
     for name, _, at in columns:

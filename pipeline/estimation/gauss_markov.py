@@ -272,8 +272,8 @@ class GaussMarkov:
         v = (1.0 / blocks.weight if variance is None else variance)[order]
         start, length, clock = blocks.start[order], blocks.length[order], blocks.clock[order]
         q = np.array([s.ratio for s in settings])[:, None] ** 2
-        times, at = np.unique([s.time for s in settings], return_inverse=True)  # a grid repeats each time
-        tau = times[:, None]
+        times = sorted({s.time for s in settings})  # a grid repeats each time
+        tau, at = np.array(times)[:, None], [times.index(s.time) for s in settings]
         of_time = _half_average(length, tau)
         same, step = clock[1:] == clock[:-1], np.maximum(np.diff(start), length[:-1])
         near = np.where(same, np.exp(-(step - length[:-1]) / tau), 0.0)[at]

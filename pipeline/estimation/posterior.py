@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -88,17 +88,9 @@ class Answers:
     sets: list[tuple[tuple[str, ...], float]]  # sets and their probability, the most probable first
     upper_limit: dict[str, Values]  # (k,), of the linear parameters of each effect
 
-    @cached_property
-    def _probabilities(self) -> dict[str, float]:
-        found: dict[str, float] = {}
-        for names, weight in self.sets:
-            for name in names:
-                found[name] = found.get(name, 0.0) + weight
-        return found
-
     def probability(self, name: str) -> float:
         """Return the probability that an effect is present."""
-        return self._probabilities.get(name, 0.0)
+        return float(sum(weight for names, weight in self.sets if name in names))
 
     def answer_set(self) -> list[tuple[tuple[str, ...], float]]:
         """Return the smallest number of sets with 95 % of the probability."""
@@ -293,7 +285,7 @@ def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]
     counts = [mean.shape[1] for _, mean, _ in mixtures]
     sizes = np.repeat([len(weight) for weight, _, _ in mixtures], counts)  # components of each of all quantities
     first, of = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
-    weight = np.concatenate([np.tile(each[0], k) for each, k in zip(mixtures, counts, strict=True)])
+    weight = np.concatenate([each[0] for each, k in zip(mixtures, counts, strict=True) for _ in range(k)])
     mean = np.abs(np.concatenate([each.T.ravel() for _, each, _ in mixtures]))
     deviation = np.maximum(np.concatenate([each.T.ravel() for _, _, each in mixtures]), 1e-300)
 

@@ -190,16 +190,17 @@ class Ranking:
         linear, variance = (blocks @ signals[..., None])[..., 0], np.maximum(rss[row, likeliest], 0.0) + self.within
         covariances = blocks @ np.linalg.solve(definite[row, likeliest], blocks.transpose(0, 2, 1))
         uncertainties = standard_uncertainty(covariances * (variance / self.samples)[:, None, None])
+        of_one = float(np.log(self.samples))
         for i, j in enumerate(members):
             term, this, best, signal = self.candidates[j], self.candidates[j].effect, int(likeliest[i]), signals[i]
             k = inner.shape[-1] + (0 if this.moves else len(this.nonlinear))
             gain = max(2.0 * (float(likelihood[i, best]) - before), 0.0)
-            values, uncertainty, at = term.values.copy(), np.zeros(len(term.values)), slice(0, len(linear[i]))
+            values, uncertainty, at = term.values.copy(), np.zeros(len(term.values)), slice(linear.shape[1])
             values[at] = linear[i] + (term.values[at] if this.moves else 0.0)
             uncertainty[at] = uncertainties[i]
             plausible = within(values, uncertainty, limits.get(this.name, np.inf))
             p, admissible = float(scipy.special.chdtrc(k, gain)), bool(weakest[i] > MIN_NEW_VARIANCE)
-            delta_bic = gain - k * float(np.log(self.samples))
+            delta_bic = gain - k * of_one
             drop = float(2.0 * signal @ cross[i, 0] - signal @ inner[i, 0] @ signal)
             score = Score(this.name, delta_bic, p, k, values, uncertainty, best, admissible, plausible, drop)
             yield j, score, likelihood[i]

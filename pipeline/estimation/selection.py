@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -73,6 +74,7 @@ def select(
     """
     observations, grid = weighted(observations, noise), selection_grid(noise)
 
+    @cache
     def models(observations: Observations) -> tuple[list[list[EffectColumns]], dict[str, EffectColumns]]:
         """Return the starts of the base with configured effects, and the candidates."""
         starts, candidates = starts_of(configured, observations, known, accelerometer), {}
@@ -82,26 +84,22 @@ def select(
             candidates[this.name] = EffectColumns(this, zeros, prior=prior)
         return starts, candidates
 
-    def searched(
-        observations: Observations,
-        given: tuple[list[list[EffectColumns]], dict[str, EffectColumns]],
-        near: Mapping[tuple[str, ...], JointFit],
-    ) -> Selection:
+    def searched(observations: Observations, near: Mapping[tuple[str, ...], JointFit]) -> Selection:
         """Select effects by all rows of the observations; ``near``: fits to most of them, from which fits start."""
-        starts, candidates = given
+        starts, candidates = models(observations)
         start, limits = ordinary_base(observations, noise), limits_of(observations.sensor, data_sheet)
         base = fit_best(observations, starts, start, grid)
         ranking = Ranking(observations, base, base, candidates, grid)
-        problem = observations, noise, data_sheet, start, grid, limits, candidates
-        selection = Selection(*problem, base, base, ranking, ranking, near=near)
+        given = observations, noise, data_sheet, start, grid, limits, candidates
+        selection = Selection(*given, base, base, ranking, ranking, near=near)
         if search:
             selection.run()
         return selection
 
     def selected() -> Selection:
-        selection = searched(observations, (starts, candidates), {})
-        remaining, near = without_unknown_motion(observations, selection.fit.terms), selection.rough | selection.fits
-        return selection if remaining is observations else searched(remaining, models(remaining), near)
+        selection = searched(observations, {})
+        remaining = without_unknown_motion(observations, selection.fit.terms)
+        return selection if remaining is observations else searched(remaining, {**selection.rough, **selection.fits})
 
     starts, candidates = models(observations)
     terms = [tuple(term.key for term in terms) for terms in ([*candidates.values()], *starts)]
