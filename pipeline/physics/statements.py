@@ -190,24 +190,22 @@ def open_words(part: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     return [(source, "these recordings leave them open, and U is valid if they are absent")]
 
 
-def implausible(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[Entry]:
-    """Return the fitted parameters of a sensor that are outside the data sheet's limits, the largest ratio first.
+def implausible(rows: Sequence[LimitRow]) -> list[Entry]:
+    """Return the fitted parameters of ``limited`` that are outside the data sheet's limits, the largest ratio first.
 
-    ``part`` is the sensor's part of ``calibrations/<unit>.json``, ``data_sheet`` the figures of the sensor. An
-    entry has ``parameter``, ``value``, ``unit``, ``limit`` of the sensor file, ``ratio`` of the two and
+    An entry has ``parameter``, ``value``, ``unit``, ``limit`` of the sensor file, ``ratio`` of the two and
     ``likely_cause``.
     """
-    rows = _limited(sensor, part, data_sheet)
     far = [row for row in rows if abs(row[1]) - 2.0 * row[2] > max(MULTIPLE * row[4], row[5])]
     return [_entry(row) | {"likely_cause": row[-1]} for row in far]
 
 
-def beyond_limits(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[Entry]:
-    """Return the fitted parameters whose absolute value exceeds the data sheet's limit, the largest ratio first.
+def beyond_limits(rows: Sequence[LimitRow]) -> list[Entry]:
+    """Return the fitted parameters of ``limited`` whose absolute value exceeds the limit, the largest ratio first.
 
-    Parameters as of ``implausible``; an entry has ``parameter``, ``value``, ``unit``, ``limit`` and ``ratio``.
+    An entry has ``parameter``, ``value``, ``unit``, ``limit`` and ``ratio``.
     """
-    return [_entry(row) for row in _limited(sensor, part, data_sheet) if abs(row[1]) > row[4]]
+    return [_entry(row) for row in rows if abs(row[1]) > row[4]]
 
 
 def beyond_words(part: Mapping[str, Any] | None) -> str:
@@ -221,8 +219,11 @@ def _entry(row: LimitRow) -> Entry:
     return {"parameter": name, "value": value, "unit": unit, "limit": limit, "ratio": abs(value) / limit}
 
 
-def _limited(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[LimitRow]:
-    """Return the rows of all parameters that the sensor file limits, the largest ratio first."""
+def limited(sensor: str, part: Mapping[str, Any], data_sheet: DataSheet) -> list[LimitRow]:
+    """Return the rows of all parameters that the sensor file limits, the largest ratio first.
+
+    ``part`` is the sensor's part of ``calibrations/<unit>.json``, ``data_sheet`` the figures of the sensor.
+    """
     rows = [*_of_bias_and_matrix(sensor, part, data_sheet), *limited_effects(sensor, part, data_sheet.effects)]
     return sorted(rows, key=lambda row: -abs(row[1]) / row[4])
 

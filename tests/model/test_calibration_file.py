@@ -13,7 +13,7 @@ from pipeline.app.steps.calibration import calibrated_range, judged
 from pipeline.core.records import Coefficient, FittedEffect, Recording, SensorCalibration
 from pipeline.ingest.quality_flags import CLIPPED
 from pipeline.physics.compensation import sample_covariance
-from pipeline.physics.statements import implausible, sentences
+from pipeline.physics.statements import implausible, limited, sentences
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def marked(model: str, sensor: str, K: np.ndarray, bias: float = 0.0, sigma: flo
     fitted = tuple(FittedEffect(n, {f"K2_{a}": Coefficient(v, "1/g", 0.0) for a in "xyz"}) for n, v in effects.items())
     covariance = sigma**2 * np.eye(12 + 3 * len(fitted))
     part = SensorCalibration(sensor, np.full(3, bias), np.linalg.inv(K), effects=fitted, covariance=covariance)
-    return implausible(sensor, part.to_json(), sheet(model, sensor))
+    return implausible(limited(sensor, part.to_json(), sheet(model, sensor)))
 
 
 @pytest.mark.parametrize("model", ["mpu6050", "stim300", "generic"])
@@ -93,7 +93,7 @@ def test_what_is_not_known_well_enough_is_not_marked() -> None:
     assert marked("mpu6050", "accelerometer", np.eye(3), 0.5, sigma=0.1) == []
     fitted = FittedEffect("quadratic_nonlinearity", {f"K2_{a}": Coefficient(0.5, "1/g") for a in "xyz"})
     part = SensorCalibration("accelerometer", effects=(fitted,)).to_json()
-    assert implausible("accelerometer", part, sheet("mpu6050", "accelerometer")) == []
+    assert implausible(limited("accelerometer", part, sheet("mpu6050", "accelerometer"))) == []
 
 
 def test_the_user_can_accept_them() -> None:

@@ -8,7 +8,7 @@ from unit_settings import sheet_of
 from pipeline.core.records import Coefficient, FittedEffect, SensorCalibration
 from pipeline.output.pages.comparison import unit_figures
 from pipeline.output.pages.parameters import fitted_parameters, parameter_rows, reading_errors, sensor_errors
-from pipeline.physics.statements import beyond_limits, beyond_words
+from pipeline.physics.statements import beyond_limits, beyond_words, limited
 
 
 def part_with_unequal_freedom() -> dict:
@@ -71,7 +71,7 @@ def test_a_parameter_far_to_either_side_is_beyond_its_limit_and_the_position_of_
     limits = {"bias": 2.0, "scale_factor": 0.03, "cross_axis": 0.02, "full_scale": 250.0}
     sheet = sheet_of(**limits, effects={"warm_up": 0.6, "warm_up_T": 600.0})
     part = fit.to_json()
-    part |= {"beyond_limits": beyond_limits("gyroscope", part, sheet)}
+    part |= {"beyond_limits": beyond_limits(limited("gyroscope", part, sheet))}
     rows = parameter_rows("gyroscope", part, sheet)
     assert {row["p"].name: row["share"] for row in rows if row["share"] > 1.0} == pytest.approx(
         {"bias_y": 2.5, "scale_factor_x": 2.0}

@@ -13,7 +13,7 @@ from unit_settings import settings_of
 from pipeline.output.pages.campaign_page import ENDS, strips
 from pipeline.output.pages.fleet import parameter_table
 from pipeline.output.pages.parameters import unit_parameters
-from pipeline.physics.statements import beyond_limits
+from pipeline.physics.statements import beyond_limits, limited
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,7 +32,7 @@ def campaign(count: int) -> tuple[list[dict[str, Any]], pd.DataFrame, np.ndarray
         bias, K = rng.normal(0.0, 0.06, 3), np.eye(3) + rng.normal(0.0, 0.01, (3, 3))
         part: dict[str, Any] = {"unit": "g", "bias": bias.tolist(), "matrix": np.linalg.inv(K).tolist(), "effects": []}
         part |= {"expanded_uncertainty": {"bias": [0.0] * 3, "matrix": [[0.0] * 3] * 3}}
-        part |= {"beyond_limits": beyond_limits("accelerometer", part, SENSOR.accelerometer)}
+        part |= {"beyond_limits": beyond_limits(limited("accelerometer", part, SENSOR.accelerometer))}
         rows.append({"unit": f"U{i}", "status": "ok", "sensor": "mpu6050", "method": "staged"})
         placed[f"U{i}"] = unit_parameters({"accelerometer": part, "gyroscope": None}, SENSOR)
         P = polar(K, side="left")[1]

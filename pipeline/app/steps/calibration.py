@@ -49,7 +49,7 @@ from pipeline.estimation.chips import Chip, chip_document
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.ingest.quality_flags import GAP
 from pipeline.output.exports import exports
-from pipeline.physics.statements import beyond_limits, implausible, not_determined, with_open
+from pipeline.physics.statements import beyond_limits, implausible, limited, not_determined, with_open
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -214,10 +214,11 @@ def judged(sensor: str, fit: dict[str, Any], data_sheet: DataSheet) -> dict[str,
 
     Which of those beyond are implausible depends on their uncertainty, and on what the configuration accepts.
     """
-    found = implausible(sensor, fit, data_sheet)
+    rows = limited(sensor, fit, data_sheet)
+    found = implausible(rows)
     accepted = data_sheet.accept_implausible
     lists = {"implausible": [] if accepted else found, "implausible_accepted": found if accepted else []}
-    lists |= {"beyond_limits": beyond_limits(sensor, fit, data_sheet)}
+    lists |= {"beyond_limits": beyond_limits(rows)}
     return fit | lists | {"not_determined": not_determined(fit)}
 
 

@@ -8,6 +8,7 @@ row by row; then ``<effect>.<parameter>``, or the parameters of a stage. The bas
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Self
@@ -39,13 +40,15 @@ def as_json(value: Any) -> Any:  # noqa: ANN401  (a record, or a value in one)
     """Return the JSON value of a record: its fields by name, arrays and tuples as lists."""
     if type(value) in PLAIN:
         return value
-    if isinstance(value, np.ndarray | np.generic):
+    if isinstance(value, (np.ndarray, np.generic)):  # a tuple: a union takes three times as long
         return value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [each if type(each) in PLAIN else as_json(each) for each in value]
     if is_dataclass(value):
         value = vars(value)
-    if isinstance(value, Mapping):
-        return {key: as_json(each) for key, each in value.items()}
-    return [as_json(each) for each in value] if isinstance(value, list | tuple) else value
+    if type(value) is dict or isinstance(value, Mapping):
+        return {key: each if type(each) in PLAIN else as_json(each) for key, each in value.items()}
+    return value
 
 
 def with_arrays(entries: Mapping[str, Any]) -> dict[str, Any]:
@@ -355,7 +358,7 @@ def _at(values: Values, rows: Sequence[int | None], absent: float = 0.0) -> Valu
 
 def finite(values: Values) -> list[float | None]:
     """Return a list for JSON, with None in place of values that are not finite."""
-    return [float(v) if np.isfinite(v) else None for v in values]
+    return [v if math.isfinite(v) else None for v in np.asarray(values, float).tolist()]
 
 
 def unlimited(values: list[float | None]) -> Values:

@@ -105,7 +105,10 @@ def _environment() -> Templates:
 
 def text_of(name: str, **values: Any) -> str:  # noqa: ANN401
     """Render a template that is not a format."""
-    return _environment().get_template(name).render(values)
+    return _template(name).render(values)
+
+
+_template = cache(lambda name: _environment().get_template(name))
 
 
 @cache
@@ -153,6 +156,16 @@ class ExportedUnit:
         return {s: SensorCalibration.from_json(s, self.document[s]) for s in SENSORS if self.document.get(s)}
 
     @cached_property
+    def of_sensors(self) -> dict[str, frozenset[str]]:
+        """Names of the effects that each calibrated sensor causes."""
+        return {s: frozenset(e.name for e in sensor_effects(c)) for s, c in self.calibrations.items()}
+
+    @cached_property
+    def before_use(self) -> list[str]:
+        """Remarks of all formats before the use of the file."""
+        return before_use(self.document)
+
+    @cached_property
     def noise_figures(self) -> dict[str, JSON]:
         """Noise parameters of each sensor, with their origin and intervals."""
         return {s: noise_figures(s, self.sheets.get(s), self.document) for s in SENSORS}
@@ -160,9 +173,8 @@ class ExportedUnit:
     def sensors(self, declared: Format) -> dict[str, ExportedSensor]:
         """Return the calibrated sensors in the units of a format."""
         found, included = {}, {*declared.effects, *declared.effects_in_part}
-        for s, calibration in self.calibrations.items():
+        for s, own in self.of_sensors.items():
             if s in declared.units:
-                own = frozenset(e.name for e in sensor_effects(calibration))
                 key = s, declared.units[s], declared.matrix.get(s, "full"), own if "all" in included else own & included
                 found[s] = self.made.once(key, partial(self._sensor, *key))
         return found
@@ -205,12 +217,18 @@ def export(format_name: str, exported: ExportedUnit, file: str | None = None) ->
     """
     declared, template = formats()[format_name]
     path = Path(declared.file.replace("{unit}", exported.document["unit"]) if file is None else file)
-    parts = {
-        f"{path.stem}{ending}{path.suffix}": replace(declared, units={s: declared.units[s]}, required=[s])
-        for s, ending in declared.sensor_endings.items()
-    } or {path.name: declared}
+    endings = declared.sensor_endings.items()
+    parts = {f"{path.stem}{ending}{path.suffix}": _of_sensor(format_name, s) for s, ending in endings}
+    parts = parts or {path.name: declared}
     texts = {name: _rendered(part, template, exported) for name, part in parts.items()}
     return {name: text for name, text in texts.items() if text is not None}
+
+
+@cache
+def _of_sensor(format_name: str, sensor: str) -> Format:
+    """Return the declaration of the file of one sensor."""
+    declared, _ = formats()[format_name]
+    return replace(declared, units={sensor: declared.units[sensor]}, required=[sensor])
 
 
 def _rendered(declared: Format, template: Template, exported: ExportedUnit) -> str | None:
@@ -230,7 +248,7 @@ def _remarks(declared: Format, sensors: dict[str, ExportedSensor], exported: Exp
     """Return the remarks in the file, each a sentence or a line."""
     included = [*declared.effects, *declared.effects_in_part]
     about = {key: getattr(exported, key) for key in ("document", "validation", "diagnosis")}
-    about |= {"declared": declared, "before_use": before_use(exported.document), "sensors": sensors}
+    about |= {"declared": declared, "before_use": exported.before_use, "sensors": sensors}
     about |= {"counts": {s: sensor.counts for s, sensor in sensors.items()}}
     every, figures = "all" in included, exported.noise_figures if declared.noise else {}
     lost = {s: [n for n in sensor.effects if n not in included and not every] for s, sensor in sensors.items()}

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
 from math import comb
 from typing import Any
 
@@ -201,7 +202,7 @@ class ExportedSensor:
         """
         return np.asarray(np.diag(self.K) / np.sum(self.K**2, axis=1))
 
-    @property
+    @cached_property
     def scale_error(self) -> float:
         """Root mean square error after a correction by ``scale``, relative to the truth, over all its directions.
 
@@ -312,6 +313,7 @@ def row_lengths(F: Values) -> tuple[Values, Values]:
     return np.diag(length), F / length[:, None]
 
 
+@lru_cache(1)  # two formats have the factors
 def accelerometer_frame(accelerometer: ExportedSensor | None, gyroscope: ExportedSensor | None) -> dict[str, Any]:
     """Return Kalibr's factors of both matrices, in the frame i in which the accelerometer's is lower triangular.
 
