@@ -36,7 +36,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import chain, count
-from pathlib import Path, PurePath
+from pathlib import Path
 from types import MappingProxyType
 from typing import IO, Any, NamedTuple
 
@@ -344,8 +344,8 @@ def record_written(results: Path, output: str, again: int) -> None:
 
 def _record_published(results: Path, plan: Mapping[str, Any]) -> None:
     """Record the published files and the number of repetitions after a publication, which may be of some files only."""
-    exchanged = {*plan["inodes"]}
-    others = {p: s for p, s in plan["before"].items() if exchanged.isdisjoint((p, *map(str, PurePath(p).parents)))}
+    exchanged = tuple(f"{path}/" for path in plan["inodes"])
+    others = {path: state for path, state in plan["before"].items() if not f"{path}/".startswith(exchanged)}
     record = {"again": plan["again"], "written": others | plan["written"]}
     write_atomically(_record(results, ""), json.dumps(record, sort_keys=True))
 

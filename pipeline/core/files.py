@@ -32,7 +32,7 @@ from functools import cache
 from importlib.util import MAGIC_NUMBER
 from json.encoder import encode_basestring
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
 from pipeline.core.errors import DamagedFileError
 
@@ -61,17 +61,27 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file under a temporary name in its folder, which is created, flush it to the disk, then rename it."""
     folder, name = os.path.split(path)
     temporary = os.path.join(folder, f".{name}.{os.getpid()}.tmp")  # noqa: PTH118  (a fleet has thousands of files)
-    try:
-        stream = open(temporary, "wb")  # noqa: PTH123, SIM115
-    except FileNotFoundError:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        stream = open(temporary, "wb")  # noqa: PTH123, SIM115
-    with stream:
+    with _new_file(temporary) as stream:
         stream.write(content.encode() if isinstance(content, str) else content)
         if not _flushed_at_end:
             stream.flush()
             os.fsync(stream.fileno())
     os.replace(temporary, path)  # noqa: PTH105
+
+
+def write_new(path: str, content: bytes) -> None:
+    """Write a file in a folder that gets its name, and is flushed, when all files are written."""
+    with _new_file(path) as stream:
+        stream.write(content)
+
+
+def _new_file(path: str) -> BinaryIO:
+    """Open a file to write; its folder is created."""
+    try:
+        return open(path, "wb")  # noqa: PTH123
+    except FileNotFoundError:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        return open(path, "wb")  # noqa: PTH123
 
 
 def state_of_files(files: Iterable[Path]) -> str:

@@ -27,7 +27,7 @@ from pipeline.app.steps.batch import Job
 from pipeline.app.steps.summary import failed_files, failed_summary
 from pipeline.core import VERSION
 from pipeline.core.errors import PipelineError, failure_of
-from pipeline.core.files import JSON, flushed_together, read_json, write_atomically, write_json
+from pipeline.core.files import JSON, flushed_together, read_json, write_atomically, write_json, write_new
 from pipeline.core.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch, Pack, as_bytes, batches_of, is_published
 from pipeline.core.verdicts import READY, kinds_of
 from pipeline.ingest.files import digests_in_pack
@@ -107,7 +107,7 @@ def _gather_unit(batch: Batch, unit: str, new: Path, *, publish: bool) -> JSON:
         document = document or failed_files(batch.packs["calibration"], unit, failure)[f"{unit}.calibration.json"]
         found = failed_summary(found, failure, document)
     for name, content in files.items():
-        write_atomically(new / name, content)
+        write_new(f"{new}/{name}", content)
     return found
 
 
@@ -136,7 +136,7 @@ def _shared(value: Any) -> Any:  # noqa: ANN401  (a JSON value)
     if isinstance(value, str):
         return sys.intern(value)
     if isinstance(value, list):
-        return [_shared(v) for v in value]
+        return [_shared(v) if isinstance(v, (str, list, dict)) else v for v in value]
     return {sys.intern(k): _shared(v) for k, v in value.items()} if isinstance(value, dict) else value
 
 
