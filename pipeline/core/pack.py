@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, cast
 
 from imu_logs.units import SENSORS
 from pipeline.core.errors import DamagedFileError
@@ -62,7 +62,7 @@ class Pack:
     def read(self, name: str) -> bytes:
         """Return the content of a member; ``DamagedFileError`` if it is missing or its checksum differs."""
         archive = self._archive
-        return cast("bytes", self._checked(lambda: _content(archive, name), name))
+        return cast("bytes", self._checked(lambda: archive.read(name), name))
 
     def digest(self, name: str) -> str:
         """Return a digest of the content of a member, which ``new_pack`` wrote as its comment."""
@@ -90,20 +90,6 @@ class Pack:
         ) as error:
             what = f"{name or 'it'} cannot be read, it is missing or damaged ({error})"
             raise DamagedFileError(f"{what}; {WRITE_AGAIN}", str(self.path)) from None
-
-
-def _content(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Return ``archive.read`` of a member that ``new_pack`` wrote, in a third of the time."""
-    member, stream = archive.getinfo(name), cast("BinaryIO", archive.fp)
-    stream.seek(member.header_offset)
-    header = stream.read(30)  # of the member: the lengths of its name and of its extra field are at byte 26
-    stream.seek(sum(int.from_bytes(header[at : at + 2], "little") for at in (26, 28)), os.SEEK_CUR)
-    content = stream.read(member.compress_size)
-    if member.compress_type == zipfile.ZIP_DEFLATED:
-        content = zlib.decompress(content, -zlib.MAX_WBITS)
-    if not header.startswith(b"PK\3\4") or zlib.crc32(content) != member.CRC:
-        raise zipfile.BadZipFile(f"Bad CRC-32 for file {name!r}")
-    return content
 
 
 def _digest(content: bytes) -> str:
