@@ -96,16 +96,14 @@ def from_parquet(content: bytes, name: str) -> list[Recording]:
     if description["schema_version"] != PARQUET_VERSION:
         found = f"schema_version {description['schema_version']} is not known to this version ({PARQUET_VERSION})"
         raise InputError(f"{found}; delete the results and run again", name)
-    decoded: dict[str, Any] = {}
+    decoded: dict[tuple[str, ...], NDArray[Any]] = {}
 
-    def read(start: int, rows: int, names: Sequence[str]) -> list[NDArray[Any]]:
-        new = [n for n in names if n not in decoded]
-        if new:
-            table = file.read(new, use_threads=False)
-            decoded.update({n: c if c.null_count else to_numpy(c) for n, c in zip(new, table.columns, strict=True)})
-        columns = [decoded[n] for n in names]
-        rest = slice(start, start + rows)
-        return [c[rest] if isinstance(c, np.ndarray) else to_numpy(c.slice(start, rows)) for c in columns]
+    def read(start: int, rows: int, names: tuple[str, ...]) -> NDArray[Any]:
+        if names not in decoded:  # of all recordings, which take their rows of it: nothing is held twice
+            columns = [c.fill_null(0) if c.null_count else c for c in file.read([*names], use_threads=False).columns]
+            numbers = [to_numpy(column) for column in columns]
+            decoded[names] = numbers[0] if len(names) == 1 else np.column_stack(numbers)
+        return decoded[names][start : start + rows]
 
     recordings: list[Recording] = []
     start = 0
@@ -119,21 +117,21 @@ class _StoredRecording(Recording):
     """A recording whose channels, below, are decoded when they are first used."""
 
     @classmethod
-    def of(cls, entry: dict[str, Any], read: Callable[[Sequence[str]], list[NDArray[Any]]]) -> Recording:
-        """Return the recording of an entry of the file's description; ``read`` returns its columns."""
+    def of(cls, entry: dict[str, Any], read: Callable[[tuple[str, ...]], NDArray[Any]]) -> Recording:
+        """Return the recording of an entry of the file's description; ``read`` returns a channel or a block."""
         recording = cls.__new__(cls)
         vars(recording).update(
             {n: entry[n] for n in COPIED_FIELDS},
-            time_ns=read(["time_ns"])[0],
+            time_ns=read(("time_ns",)),
             notes=tuple(map(Note.of, entry["notes"])),
             stored=lambda names: read(names) if names[0] in entry["columns"] else None,
         )
         return recording
 
-    def channels(self, names: Sequence[str]) -> NDArray[Any] | None:
+    def channels(self, names: tuple[str, ...]) -> NDArray[Any] | None:
         """Return a channel, or a block of three or four; None if the file does not have it."""
-        columns = vars(self)["stored"](names)
-        return None if columns is None else columns[0] if len(names) == 1 else np.column_stack(columns)
+        found: NDArray[Any] | None = vars(self)["stored"](names)
+        return found
 
 
 for _name, _channels in {**BLOCKS, **{name: (name,) for name in SINGLES}}.items():
