@@ -109,14 +109,14 @@ class Request(NamedTuple):
     streams: list[int]
 
     @property
-    def argv(self) -> list[str]:
-        """Arguments."""
-        return os.fsdecode(self.message).split("\0")[1:]
+    def words(self) -> list[str]:
+        """Folder and arguments."""
+        return os.fsdecode(self.message).split("\0")
 
     @property
     def batch(self) -> str:
         """Folder of the batch of a job that reads or writes results of steps; else empty."""
-        stage, *options = self.argv
+        _, stage, *options = self.words
         if stage not in STEPS:
             return ""
         inputs = INPUTS[stage]
@@ -219,7 +219,7 @@ def _run_jobs(run_command: Callable[[list[str]], int], request: Request, channel
     RESULTS.keeps = channel is not None
     while True:
         code = _run_job(run_command, request)
-        last = not channel or code != 0 or request.argv[0] == LAST or _resident_bytes() > MOST_BYTES
+        last = not channel or code != 0 or request.words[1] == LAST or _resident_bytes() > MOST_BYTES
         if channel and not last:
             release_locks()
             channel.send(b".")  # before the command ends: the next one may follow at once
@@ -241,7 +241,7 @@ def _run_job(run_command: Callable[[list[str]], int], request: Request) -> int:
     for number, stream in enumerate(request.streams):
         os.dup2(stream, number)
         os.close(stream)
-    directory, *argv = os.fsdecode(request.message).split("\0")
+    directory, *argv = request.words
     os.chdir(directory)
     sys.argv[1:] = argv
     done = threading.Event()
