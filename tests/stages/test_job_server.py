@@ -69,6 +69,8 @@ def test_the_jobs_of_a_batch_share_a_process_until_one_fails_or_is_killed(tmp_pa
 
     refused()  # its process ends with it: the next job gets another
     refused()
+    while _process_in(tmp_path):  # that of the job before, which ends
+        time.sleep(0.01)
     with subprocess.Popen([*job, "settings"], cwd=tmp_path) as command:
         while not (process := _process_in(tmp_path, but=command.pid)):
             time.sleep(0.01)
