@@ -37,7 +37,7 @@ def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path: Path, monkeypatc
 
 
 def test_a_number_that_is_not_finite_is_refused_with_its_place() -> None:
-    with pytest.raises(ValueError, match=r"not JSON compliant.*: value\.z \(gyroscope_bias_x U1\) is nan"):
+    with pytest.raises(ValueError, match=r"not JSON compliant: value\.far\[0\]\.z \(gyroscope_bias_x U1\) is nan"):
         json_text({"far": [{"parameter": "gyroscope_bias_x", "name": "U1", "z": float("nan")}]})
     with pytest.raises(ValueError, match=r"value\[1\] is inf"):
         json_text([1.0, float("inf")])

@@ -28,7 +28,7 @@ import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from importlib.util import MAGIC_NUMBER
 from json.encoder import encode_basestring
 from pathlib import Path
@@ -47,7 +47,6 @@ EFFECTS_FOLDER = CONFIGS / "effect"
 FORMULA = re.compile(r"'*[=+\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 WRITE_AGAIN = "run the same command again: snakemake writes the file anew"
-_encoder = json.JSONEncoder(ensure_ascii=False, allow_nan=False, default=lambda array: array.tolist())  # numpy arrays
 _flushed_at_end: list[Path] = []  # folders whose files are flushed together
 Check = Callable[[Any], Any]
 FOLDERS = {"darwin": "~/Library/Caches", "win32": "~/AppData/Local"}  # by platform; others: XDG base directories
@@ -98,22 +97,18 @@ def read_json(path: Path, read: Callable[[Path], bytes] = Path.read_bytes) -> An
 
     Raises ``DamagedFileError`` if it does not exist or is not JSON.
     """
+    from pydantic_core import from_json  # noqa: PLC0415  (takes a fifth of the time of ``json.loads``)
+
     try:
-        return json.loads(read(path))
+        return from_json(read(path))
     except (OSError, ValueError) as error:
         reason = f"cannot be read, it is missing or damaged ({error}); {WRITE_AGAIN}"
         raise DamagedFileError(reason, str(path)) from None
 
 
-def _encoded(value: Any) -> str:  # noqa: ANN401
-    try:
-        return _encoder.encode(value)
-    except ValueError as error:
-        raise ValueError(f"{error}: {', '.join(_not_finite(value))}") from None
-
-
 def _not_finite(value: Any, place: str = "value") -> Iterator[str]:  # noqa: ANN401
     """Yield the place of each number that is not finite, with the texts in the same objects, which identify it."""
+    value = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, float) and not math.isfinite(value):
         yield f"{place} is {value}"
     elif isinstance(value, dict):
@@ -125,21 +120,31 @@ def _not_finite(value: Any, place: str = "value") -> Iterator[str]:  # noqa: ANN
             yield from _not_finite(member, f"{place}[{number}]")
 
 
-def json_text(value: Any, levels: int = 3, indent: str = "\n") -> str:  # noqa: ANN401
+def json_text(value: Any, levels: int = 3) -> str:  # noqa: ANN401
     """Return a value as JSON; ``ValueError`` names the place of a number that is not finite.
 
-    Down to ``levels``, containers of containers are indented. Each other container is on one line, which C code writes.
+    Down to ``levels``, containers of containers are indented. Each other value is on one line, without blanks, which
+    takes a tenth of the time of ``json.dumps``.
     """
-    if levels and isinstance(value, dict | list) and value:
-        members = list(value.values() if isinstance(value, dict) else value)
-        if any(isinstance(member, dict | list | tuple) for member in members):
-            keyed = isinstance(value, dict)
-            names = [f"{encode_basestring(str(n))}: " if keyed else "" for n in value]
-            inner = indent + " "
-            lines = [name + json_text(m, levels - 1, inner) for name, m in zip(names, members, strict=True)]
-            opening, closing = "{}" if isinstance(value, dict) else "[]"
-            return f"{opening}{inner}{f',{inner}'.join(lines)}{indent}{closing}"
-    return _encoded(value)
+    from pydantic_core import to_json  # noqa: PLC0415  (a command that writes no JSON need not import it)
+
+    encode = partial(to_json, inf_nan_mode="constants", fallback=lambda array: array.tolist())  # numpy arrays
+
+    def text_of(value: Any, levels: int, indent: str) -> str:  # noqa: ANN401
+        if levels and isinstance(value, (dict, list)):  # a tuple: a union takes three times as long
+            members = list(value.values() if isinstance(value, dict) else value)
+            if any(isinstance(member, (dict, list, tuple)) for member in members):
+                opening, closing = "{}" if isinstance(value, dict) else "[]"
+                names = [f"{encode_basestring(str(n))}: " if opening == "{" else "" for n in value]
+                inner = indent + " "
+                lines = [name + text_of(m, levels - 1, inner) for name, m in zip(names, members, strict=True)]
+                return f"{opening}{inner}{f',{inner}'.join(lines)}{indent}{closing}"
+        return encode(value).decode()
+
+    text = text_of(value, levels, "\n")
+    if ("NaN" in text or "Infinity" in text) and (places := ", ".join(_not_finite(value))):
+        raise ValueError(f"numbers that are not finite are not JSON compliant: {places}")
+    return text
 
 
 def write_json(path: Path, value: Any) -> None:  # noqa: ANN401

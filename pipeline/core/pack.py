@@ -130,11 +130,11 @@ def directory_of(path: str) -> str:
         return hashlib.sha256(stream.read()).hexdigest()
 
 
-def as_bytes(content: Any) -> bytes:  # noqa: ANN401
-    """Return the content of a file: bytes unchanged, text as UTF-8, other values as JSON."""
+def as_bytes(content: Any, *, published: bool = True) -> bytes:  # noqa: ANN401
+    """Return the content of a file: bytes unchanged, text as UTF-8, other values as JSON, if published with lines."""
     if isinstance(content, bytes):
         return content
-    return (content if isinstance(content, str) else json_text(content) + "\n").encode()
+    return (content if isinstance(content, str) else json_text(content, 3 * published) + "\n").encode()
 
 
 class Batch:

@@ -50,6 +50,7 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
 }
 OPTIONS = {"ingest": ("recordings",), "fit": ("sensor", "stage", "previous")}
 AFTER_FIT = ("diagnose", "export", "report", "summary", "prior")  # a calibration does not depend on them
+READ_BY_STAGES = ("ingest", "filter", "fit")  # alone: their JSON has no lines for a reader
 INPUTS_OF = ".inputs"  # member of a pack: digest of a unit's inputs, and the names of its files
 CPU_TIME = "s of CPU time"  # in the last line of a job's log
 # settings by unit, of which ``<stage>_reads`` returns those of one, and how a pack is written
@@ -172,7 +173,7 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
     parser.add_argument("--output", type=Path, required=True, help="file to write")
     for name in INPUTS[stage]:
         parser.add_argument(f"--{name}", type=Path, required=True, help=f"pack of the stage {name}")
-    for name in ("code", *OPTIONS.get(stage, ())):
+    for name in OPTIONS.get(stage, ()):
         parser.add_argument(f"--{name}", default="", help=f"{name} of this stage")
     arguments = vars(parser.parse_args(argv))
     config: Path = arguments.pop("config")
@@ -233,20 +234,20 @@ def _files_of(module: ModuleType, job: Job, unit: str, settings: Settings) -> di
         failure = failure_of(error, unit, stage)
         print(f"{stage}: {unit} FAILED: {failure['message']}", file=sys.stderr, flush=True)
     of_failed = getattr(module, f"{job.stage}_failed", None)
-    return _encoded({name: failure} | (of_failed(job, unit, settings, failure) if of_failed else {}))
+    return _encoded(job, {name: failure} | (of_failed(job, unit, settings, failure) if of_failed else {}))
 
 
 def _made_or_replaced(module: ModuleType, job: Job, unit: str, settings: Settings, stage: str) -> dict[str, bytes]:
     """Return the files that a stage makes of a unit; of a stage after the fit that fails, those that replace them."""
     try:
-        return _encoded(_made(module, job, unit, settings))
+        return _encoded(job, _made(module, job, unit, settings))
     except Exception as error:
         if job.stage not in AFTER_FIT:
             raise
         record = omission(error, unit, stage)
         without = getattr(module, f"{job.stage}_without", None)
         instead = without(job, unit, settings, record) if without else {}
-        return _encoded({**instead, unit + INCOMPLETE_SUFFIX: [record]})
+        return _encoded(job, {**instead, unit + INCOMPLETE_SUFFIX: [record]})
 
 
 def _made(module: ModuleType, job: Job, unit: str, settings: Settings) -> Files:
@@ -267,8 +268,8 @@ def _made(module: ModuleType, job: Job, unit: str, settings: Settings) -> Files:
     return FILES[job.stage](unit, made)
 
 
-def _encoded(files: Files) -> dict[str, bytes]:
-    return {name: as_bytes(content) for name, content in files.items()}
+def _encoded(job: Job, files: Files) -> dict[str, bytes]:
+    return {name: as_bytes(content, published=job.stage not in READ_BY_STAGES) for name, content in files.items()}
 
 
 def verdict(argv: Sequence[str]) -> int:
