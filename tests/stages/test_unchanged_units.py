@@ -37,8 +37,8 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # noqa: ANN201
         (tmp_path / "results" / "configs").mkdir(parents=True, exist_ok=True)
         config = tmp_path / "results" / "configs" / "diagnose.json"
         units = {u: {"diagnosis": {"depth": "full" if effects.get(u, 0) else "standard"}} for u in ("U1", "U10")}
-        config.write_text(json.dumps({"units": units} | ({"again": again} if again else {})))
-        argv = ["--config", str(config), "--output", str(output), "--code", code]
+        config.write_text(json.dumps({"units": units, "code": code} | ({"again": again} if again else {})))
+        argv = ["--config", str(config), "--output", str(output)]
         for stage, changed in files.items():
             with new_pack(tmp_path / f"{stage}.zip") as add:
                 add({f"{u}.json": changed.get(u, "x").encode() for u in ("U1", "U10")})

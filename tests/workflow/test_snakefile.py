@@ -105,9 +105,10 @@ def test_a_mended_unit_reruns_its_batch_only(runs: Mended) -> None:
 
 
 def test_a_change_in_the_code_of_a_method_makes_its_fits_again(runs: Mended) -> None:
-    """Snakemake runs a job again where its command differs, which holds a digest of the code."""
-    found = re.findall(r" fit .*--sensor (\S+) --stage (\S+) .*--code (\S+) ", runs.first.output)
-    codes = {(sensor, stage): code for sensor, stage, code in found}
+    """Snakemake runs a job again where its settings file has another name: the file holds a digest of the code."""
+    found = re.findall(r" fit --config (\S+) --sensor (\S+) --stage (\S+) ", runs.first.output)
+    settings = {(sensor, stage): runs.bench.directory / file for file, sensor, stage in found}
+    codes = {fit: json.loads(file.read_text())["code"] for fit, file in settings.items()}
     modules = {
         ("accelerometer", "reference_least_squares"): "reference_least_squares",
         ("gyroscope", "reference_least_squares"): "reference_least_squares",

@@ -15,8 +15,6 @@ rule calibration:
     resources:
         mem_mb=1000,
         runtime=10,
-    params:
-        code=code_digest("pipeline.app.steps.calibration"),
     shell:
-        "{RUN} calibration --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --accelerometer {input.accelerometer:q}"
+        "{RUN} calibration --config {input.settings:q} --ingest {input.ingest:q} --accelerometer {input.accelerometer:q}"
         " --gyroscope {input.gyroscope:q} --validate {input.validate:q} --diagnose {input.diagnose:q} --output {output:q} > {log:q} 2>&1"

@@ -23,7 +23,6 @@ from pipeline.app.config import code_digest, load_campaign, settings_of_jobs
 from pipeline.app.config.owner import check_owner, claim, complete_record
 from pipeline.core.errors import PipelineError
 from pipeline.core.files import write_atomically
-from pipeline.estimation.stages import stage_module
 from pipeline.output.outcome import outcome
 from pipeline.core.pack import PACKED_STEPS as PUBLISHED_STAGES
 from pipeline.app.results_folder import finish_publishing, repetitions, replaced_folders
@@ -188,14 +187,6 @@ def stage_before(wildcards):
     chain = PLAN["chains"][wildcards.batch][wildcards.sensor]
     i = chain.index(wildcards.stage)
     return f"{BATCH}/fit/{{sensor}}/{chain[i - 1]}.zip".format(**wildcards) if i else []
-
-
-def code_of_fit(wildcards):
-    modules = (
-        "pipeline.app.steps.fit",
-        stage_module(wildcards.sensor, wildcards.stage),
-    )
-    return "".join(code_digest(module) for module in modules)
 
 
 def pages(wildcards):

@@ -15,8 +15,6 @@ rule diagnose:
     resources:
         mem_mb=1000,
         runtime=10,
-    params:
-        code=code_digest("pipeline.app.steps.diagnose"),
     shell:
-        "{RUN} diagnose --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
+        "{RUN} diagnose --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
         " --gyroscope {input.gyroscope:q} --validate {input.validate:q} --output {output:q} > {log:q} 2>&1"

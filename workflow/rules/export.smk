@@ -13,8 +13,6 @@ rule export:
     resources:
         mem_mb=1000,
         runtime=10,
-    params:
-        code=code_digest("pipeline.app.steps.calibration"),
     shell:
-        "{RUN} export --config {input.settings:q} --code {params.code} --calibration {input.calibration:q} --validate {input.validate:q}"
+        "{RUN} export --config {input.settings:q} --calibration {input.calibration:q} --validate {input.validate:q}"
         " --diagnose {input.diagnose:q} --output {output:q} > {log:q} 2>&1"

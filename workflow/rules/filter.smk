@@ -11,7 +11,5 @@ rule filter:
     resources:
         mem_mb=1000,
         runtime=10,
-    params:
-        code=code_digest("pipeline.app.steps.ingest"),
     shell:
-        "{RUN} filter --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --output {output:q} > {log:q} 2>&1"
+        "{RUN} filter --config {input.settings:q} --ingest {input.ingest:q} --output {output:q} > {log:q} 2>&1"

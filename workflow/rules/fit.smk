@@ -15,9 +15,7 @@ rule fit:
     resources:
         mem_mb=1000,
         runtime=10,
-    params:
-        code=code_of_fit,
     shell:
         "{RUN} fit --config {input.settings:q} --sensor {wildcards.sensor} --stage {wildcards.stage}"
-        " --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q} --previous={input.previous:q} --output {output:q}"
+        " --ingest {input.ingest:q} --filter {input.filter:q} --previous={input.previous:q} --output {output:q}"
         " > {log:q} 2>&1"

@@ -15,7 +15,5 @@ rule gather:
     resources:
         mem_mb=1000,
         runtime=10,
-    params:
-        code=code_digest("pipeline.app.steps.gather"),
     shell:
         "{RUN} gather --config {input.settings:q} --output {output:q} > {log:q} 2>&1"

@@ -21,8 +21,6 @@ if PLAN["apart"]:
         resources:
             mem_mb=1000,
             runtime=10,
-        params:
-            code=code_digest("pipeline.app.steps.ingest"),
         shell:
             "{RUN} collect --config {input.settings:q} --output {output:q} > {log:q} 2>&1"
 
@@ -40,7 +38,5 @@ rule ingest:
     resources:
         mem_mb=1000,
         runtime=10,
-    params:
-        code=code_digest("pipeline.app.steps.ingest"),
     shell:
-        "{RUN} ingest --config {input.settings:q} --code {params.code} --recordings={input.recordings:q} --output {output:q} > {log:q} 2>&1"
+        "{RUN} ingest --config {input.settings:q} --recordings={input.recordings:q} --output {output:q} > {log:q} 2>&1"

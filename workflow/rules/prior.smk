@@ -18,8 +18,6 @@ if PLAN["combine"] == "lot":
         resources:
             mem_mb=1000,
             runtime=10,
-        params:
-            code=code_digest("pipeline.app.steps.prior"),
         shell:
             "{RUN} lots --config {input.settings:q} --output {output:q} > {log:q} 2>&1"
 
@@ -41,9 +39,7 @@ if PLAN["combine"] == "lot":
         resources:
             mem_mb=1000,
             runtime=10,
-        params:
-            code=code_digest("pipeline.app.steps.prior"),
         shell:
-            "{RUN} prior --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q}"
+            "{RUN} prior --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q}"
             " --calibration {input.calibration:q} --validate {input.validate:q} --diagnose {input.diagnose:q}"
             " --report {input.report:q} --lots {input.lots:q} --output {output:q} > {log:q} 2>&1"

@@ -16,9 +16,7 @@ rule report:
     resources:
         mem_mb=1000,
         runtime=10,
-    params:
-        code=code_digest("pipeline.app.steps.report"),
     shell:
-        "{RUN} report --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q} --calibration {input.calibration:q}"
+        "{RUN} report --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q} --calibration {input.calibration:q}"
         " --validate {input.validate:q} --diagnose {input.diagnose:q}"
         " --export {input.export:q} --output {output:q} > {log:q} 2>&1"

@@ -14,8 +14,6 @@ rule summary:
     resources:
         mem_mb=1000,
         runtime=10,
-    params:
-        code=code_digest("pipeline.app.steps.summary"),
     shell:
-        "{RUN} summary --config {input.settings:q} --code {params.code} --calibration {input.calibration:q} --validate {input.validate:q}"
+        "{RUN} summary --config {input.settings:q} --calibration {input.calibration:q} --validate {input.validate:q}"
         " --diagnose {input.diagnose:q} --report {input.report:q} --output {output:q} > {log:q} 2>&1"

@@ -14,8 +14,6 @@ rule validate:
     resources:
         mem_mb=1000,
         runtime=10,
-    params:
-        code=code_digest("pipeline.app.steps.diagnose"),
     shell:
-        "{RUN} validate --config {input.settings:q} --code {params.code} --ingest {input.ingest:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
+        "{RUN} validate --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
         " --gyroscope {input.gyroscope:q} --output {output:q} > {log:q} 2>&1"

@@ -11,7 +11,5 @@ rule verdict:
     resources:
         mem_mb=1000,
         runtime=10,
-    params:
-        results=lambda wildcards: str(CAMPAIGN.results),
     shell:
-        "{RUN} verdict --failures {input.failures:q} --results {params.results:q} --output {output:q} 2> {log:q}"
+        "{RUN} verdict --failures {input.failures:q} --results {CAMPAIGN.results:q} --output {output:q} 2> {log:q}"

@@ -2,7 +2,8 @@
 
 A job reads its settings from one file, an input of its rule that is named after its content. A changed setting
 therefore repeats exactly the stages that read it. ``common`` in the file holds the settings that all units of a batch
-share. A digest of the code is a parameter of the rule, because Snakemake does not detect changes of the package.
+share, ``code`` a digest of the code, because Snakemake does not detect changes of the package. (As a parameter of the
+rule it would cost 0.3 s: for parameters Snakemake imports pandas.)
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from imu_logs.units import SENSORS
 from pipeline.app.config.options import GIVEN, effects_for
+from pipeline.app.steps import MODULES
 from pipeline.core.files import EFFECTS_FOLDER, canonical_json, from_cache, state_of_files, to_cache
 from pipeline.core.settings import OF_BENCH, Board, Settings, Stated, Unit
+from pipeline.estimation.stages import stage_module
 from pipeline.ingest.files import state_of_recordings
 from pipeline.output.history import digest
 from pipeline.unit import EFFECTS_STAGE, STEPS
@@ -127,7 +130,10 @@ def settings_of_jobs(
 
 
 def _file(output: str, content: dict[str, Any], again: int) -> SettingsFile:
-    text = canonical_json(content | ({"again": again} if again else {}))
+    step, *fit = output.split("/")
+    modules = [f"pipeline.app.steps.{MODULES[step]}", *([stage_module(*fit)] if fit else ())]
+    code = "".join(map(code_digest, modules))
+    text = canonical_json(content | {"code": code} | ({"again": again} if again else {}))
     return SettingsFile(f"{output.replace('/', '-')}-{hashlib.sha256(text).hexdigest()[:16]}.json", text)
 
 
