@@ -317,11 +317,13 @@ def _stated(unit: str, stretches: Sequence[RestStretch], interval: float) -> JSO
     readings = [s.reading for s in stretches]
     steps = np.concatenate([np.abs(np.diff(values, axis=0)) for values in readings])
     scale = np.sqrt(np.mean(steps**2, axis=0) / 2.0)
+    counts = np.min(steps, axis=0, initial=np.inf, where=steps > 1e-9 * scale)
+    del steps  # before the variances, which take the most memory
     tau, variance, freedom = octave_variances([values / np.maximum(scale, 1e-300) for values in readings], interval)
     squares, limits, sums = _fitted_octaves(tau, variance.T, freedom, sum(map(len, readings)))
     departure = np.abs(variance.T / np.maximum(sums, 1e-300) - 1.0) * np.sqrt(0.5 * freedom)
     axes: JSON = dict.fromkeys(AXES, CONSTANT_READINGS)
-    for c in np.flatnonzero(steps.any(axis=0)).tolist():
+    for c in np.flatnonzero(np.isfinite(counts)).tolist():
         terms: dict[str, SeenTerm | UnseenTerm] = {"temperature": UnseenTerm(f"{unit}/degC", NOT_OF_A_RUN)}
         terms |= {name: UnseenTerm(unit_of(name, unit), NOT_OF_A_RUN) for name in ("quantisation", "ramp")}
         for kind, square, limit in zip(N_B_K, squares[c], limits[c], strict=True):
@@ -329,7 +331,6 @@ def _stated(unit: str, stretches: Sequence[RestStretch], interval: float) -> JSO
             absent = UnseenTerm(unit_of(name, unit), NOT_SHOWN, float(scale[c] * np.sqrt(limit)))
             terms[name] = SeenTerm(name, Bounded(size, None), unit_of(name, unit)) if size else absent
         doubts = [OTHER_SPECTRUM] if departure[c].max() > MOST_DEPARTURE else []
-        count = float(steps[steps[:, c] > 1e-9 * scale[c], c].min())
         curves = {"tau_s": tau, "deviation": scale[c] * np.sqrt(variance[:, c]), "fit": scale[c] * np.sqrt(sums[c])}
         axes[AXES[c]] = {
             "terms": {name: term.to_json() for name, term in terms.items()} | {STOCHASTIC[MARKOV]: [], "sinusoid": []},
@@ -337,7 +338,7 @@ def _stated(unit: str, stretches: Sequence[RestStretch], interval: float) -> JSO
             "ranking": [],
             "p_value": None,
             "allan": _rounded(curves) | {"low": None, "high": None},
-            "doubts": [*doubts, *_coarse(float(scale[c]), count, unit)],
+            "doubts": [*doubts, *_coarse(float(scale[c]), float(counts[c]), unit)],
         }
     return axes
 

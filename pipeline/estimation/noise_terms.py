@@ -149,7 +149,8 @@ def octave_variances(stretches: Sequence[Values], interval: float) -> tuple[Valu
         np.cumsum(values - values.mean(axis=0), axis=0, out=theta[1:])
         for row, m in enumerate(lengths[: int(np.log2(n // 4)) + 1].tolist()):
             step = max(1, m // PER_AVERAGE)
-            second = theta[2 * m :: step] - 2.0 * theta[m:-m:step] + theta[: -2 * m : step]
+            second = 2.0 * theta[m:-m:step]
+            second = np.add(np.subtract(theta[2 * m :: step], second, out=second), theta[: -2 * m : step], out=second)
             squares[row] += np.einsum("ik,ik->k", second, second)
             terms[row] += len(second)
             freedom[row] += (1.5 * n / m - 2.0 * (n - 1) / (n + 1)) * 4.0 * m**2 / (4.0 * m**2 + 5.0)

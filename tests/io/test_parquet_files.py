@@ -19,6 +19,7 @@ from unit_settings import ingest_of
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import Note, Recording
+from pipeline.ingest import arrow
 from pipeline.ingest.read import read_recordings
 
 if TYPE_CHECKING:
@@ -70,9 +71,11 @@ def test_any_bits_come_back(tmp_path: Path, values: np.ndarray, times: np.ndarra
 
 
 def test_recording_without_samples_comes_back(tmp_path: Path) -> None:
-    saved = [make_recording(5), make_recording(5).select(slice(0, 0)), make_recording(6)]
-    save_recordings(tmp_path / "a.parquet", saved)
-    assert [r.samples for r in load_recordings(tmp_path / "a.parquet")] == [5, 0, 6]
+    empty = make_recording(5).select(slice(0, 0))
+    save_recordings(tmp_path / "a.parquet", [empty, make_recording(5), empty, make_recording(6), empty])
+    loaded = load_recordings(tmp_path / "a.parquet")
+    assert [r.samples for r in loaded] == [0, 5, 0, 6, 0]
+    assert [len(r.reading("gyroscope")) for r in loaded] == [0, 5, 0, 6, 0]
 
 
 def counts(folder: Path) -> list[Recording]:
@@ -107,15 +110,30 @@ def test_the_recordings_of_a_unit_are_one_row_group(tmp_path: Path) -> None:
     assert [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)] == [120 + 7 + 33]
 
 
+@pytest.mark.parametrize("least", [1, 100, 127, 1000])
+def test_long_recordings_have_row_groups_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, least: int
+) -> None:
+    monkeypatch.setattr(arrow, "MIN_ROW_GROUP", least)
+    monkeypatch.setattr(arrow, "ROW_GROUP", 50)
+    save_recordings(tmp_path / "a.parquet", unit())
+    metadata = parquet.read_metadata(tmp_path / "a.parquet")
+    rows = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+    apart = [50, 50, 20, 7, 33] if least == 1 else [50, 50, 20, 40] if least == 100 else [50, 50, 27, 33]
+    assert rows == ([50, 50, 50, 10] if least == 1000 else apart)
+    for one, other in zip(unit(), load_recordings(tmp_path / "a.parquet"), strict=True):
+        assert_same_bits(one, other)
+
+
 def test_a_channel_is_decoded_when_it_is_used_first_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     decoded: list[list[str] | None] = []
-    read = parquet.ParquetFile.read
+    read = parquet.ParquetFile.read_row_groups
 
-    def counted(self: Any, columns: list[str] | None = None, **options: Any) -> Any:
+    def counted(self: Any, groups: list[int], columns: list[str] | None = None, **options: Any) -> Any:
         decoded.append(columns)
-        return read(self, columns, **options)
+        return read(self, groups, columns, **options)
 
-    monkeypatch.setattr(parquet.ParquetFile, "read", counted)
+    monkeypatch.setattr(parquet.ParquetFile, "read_row_groups", counted)
     save_recordings(tmp_path / "a.parquet", unit())
     loaded = load_recordings(tmp_path / "a.parquet")
     assert [r.samples for r in loaded] == [120, 7, 33]

@@ -438,12 +438,12 @@ def conjugate_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray
 def attitude_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation matrices of unit quaternions: (n, 4) to (n, 3, 3), body vectors to level vectors."""
     w, x, y, z = q.T
-    rows = (
-        *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        *(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-        *(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-    )
-    return np.stack(rows, axis=1).reshape(-1, 3, 3)
+    R: NDArray[np.float64] = np.empty((len(q), 3, 3))
+    for i, (a, b, c) in enumerate(((x, y, z), (y, z, x), (z, x, y))):  # the axis and the next two
+        j = (i + 1) % 3
+        R[:, i, i] = 1.0 - 2.0 * (b * b + c * c)
+        R[:, i, j], R[:, j, i] = 2.0 * (a * b - w * c), 2.0 * (a * b + w * c)
+    return R
 
 
 def level_in_body(q: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -480,8 +480,13 @@ def _density(parts: Sequence[tuple[float, Values]], time: float) -> float | None
 
 def _motion(recordings: Sequence[Recording]) -> dict[str, float | None]:
     """Return the extent of held-out motion by the readings."""
-    rates = [r.gyroscope - np.nanmedian(r.gyroscope, axis=0) for r in recordings if r.gyroscope is not None]
-    forces = [r.accelerometer - np.nanmean(r.accelerometer, axis=0) for r in recordings if r.accelerometer is not None]
-    rms = [float(np.sqrt(np.nanmean(np.sum(np.concatenate(v) ** 2, axis=1)))) if v else None for v in (rates, forces)]
+    rates = [_squared_lengths(r.gyroscope, np.nanmedian) for r in recordings if r.gyroscope is not None]
+    forces = [_squared_lengths(r.accelerometer, np.nanmean) for r in recordings if r.accelerometer is not None]
+    rms = [float(np.sqrt(np.nanmean(np.concatenate(v)))) if v else None for v in (rates, forces)]
     duration = float(sum(r.time[-1] - r.time[0] for r in recordings))
     return {"rate_dps": rms[0], "force_change_g": rms[1], "duration_s": duration}
+
+
+def _squared_lengths(readings: Values, centre: Callable[..., Values]) -> Values:
+    """Return the squared lengths of readings less their centre: (n,) array."""
+    return np.asarray(np.sum((readings - centre(readings, axis=0)) ** 2, axis=1))

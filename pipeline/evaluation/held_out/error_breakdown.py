@@ -192,7 +192,7 @@ def _lack(fitted: FittedEffect, samples: Samples) -> str | None:
     """Return what the held-out recording lacks to subtract an effect, or None."""
     found = effect_of(fitted)
     if samples.motion is not None or _elsewhere(fitted, samples):
-        missing = [need for need in found.needs if samples.motion and getattr(samples.motion, need) is None]
+        missing = [need for need in found.needs if samples.motion and not samples.motion.has(need)]
         return f"the held-out recording holds no {' and no '.join(missing)}" if missing else None
     if found.moves:
         few = not samples.resting and len(samples.time) <= SPLINE_DEGREE
@@ -224,12 +224,12 @@ def _with_effects(calibration: SensorCalibration, effects: Sequence[FittedEffect
     if samples.motion is None:
         moves = [fitted for fitted in effects if fitted not in of_reading]
         return _by_calibrated_log(calibration, of_reading, samples), _moved_magnitude(samples, moves), None
-    motion = _moved(samples.motion, effects)
-    rest = SensorEffects.of(calibration, of_reading).take_off(samples.reading, motion)
-    moved, logged = truth(samples.sensor, motion), truth(samples.sensor, samples.motion)
-    change = length(moved) - length(logged)
-    direction = moved if direction_known(calibration, samples) else None
-    return linear_truth(calibration, rest), samples.magnitude + change, direction
+    motion, magnitude = _moved(samples.motion, effects), samples.magnitude
+    found = linear_truth(calibration, SensorEffects.of(calibration, of_reading).take_off(samples.reading, motion))
+    moved = truth(samples.sensor, motion)
+    if motion is not samples.motion:
+        magnitude = magnitude + (length(moved) - length(truth(samples.sensor, samples.motion)))
+    return found, magnitude, moved if direction_known(calibration, samples) else None
 
 
 def direction_known(calibration: SensorCalibration, samples: Samples) -> bool:
