@@ -47,7 +47,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -83,11 +83,13 @@ TAIL = 0.005  # probability on each side of a 99 % interval
 # Probabilities at which the factors are computed; the weight of each is the probability between the middles.
 LEVELS = np.array([0.0005, 0.004, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.996, 0.9995])
 WEIGHTS = np.diff(np.concatenate([[0.0], 0.5 * (LEVELS[1:] + LEVELS[:-1]), [1.0]]))
+FORM_SAMPLES = 500  # of a recording, in its quadratic form: intervals of 1,938 samples change by 1.1e-4 at most
 HELD_OUT_BLOCKS = 40  # of all held-out recordings; wander within a block counts as noise with its correlation time
 SMALLEST_WIDTH = 0.5  # s of a wander of minutes, which may be a random walk (blind study, family null_random_walk)
 REST_SAMPLES = 300  # that determine the white noise without a static recording: a few rests of seconds
 EXACT_FREEDOM = 1e4  # degrees of freedom beyond which nu / chi^2(nu) is 1 to 1.4 %
 NORMAL_FREEDOM = 1e6  # beyond which a chi-square is normal to 1e-3
+QUANTILE_STEP, MAX_QUANTILE_STEPS = 1e-6, 100  # relative; a bracket of 1e-6 to 60 deviations is halved 30 times
 
 
 def error_breakdown(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[list[StepErrors], list[str]]:
@@ -308,6 +310,12 @@ class LinearizedSamples:
     number: int  # known samples of the recording
     correlated_samples: float = 1.0  # as in ``Samples``
 
+    def thinned(self) -> LinearizedSamples:
+        """Return every second, third .. sample, ``FORM_SAMPLES`` or fewer."""
+        step = -(-len(self.time) // FORM_SAMPLES)
+        thin: dict[str, Any] = {name: each[::step] for name, each in vars(self).items() if isinstance(each, np.ndarray)}
+        return self if step == 1 else replace(self, **thin)
+
 
 def linearized(calibration: SensorCalibration, samples: Samples) -> LinearizedSamples | None:
     """Return representative held-out samples with their derivative; None where an effect is left out of them.
@@ -466,14 +474,15 @@ def _form(
     total = sum(each.number for each in held_out)
     white, within, size = np.zeros(2), np.zeros(2), q
     of_parameters, of_blocks = np.zeros((q, q)), []
-    for each in held_out:
+    for every in held_out:
+        each, whole = every.thinned(), len(every.time)
         n, share = len(each.truth), each.number / total
         count = max(1, min(n, round(HELD_OUT_BLOCKS * share)))
         label = np.arange(n) * count // n
         first = np.searchsorted(label, np.arange(count))
-        interval = (each.time[-1] - each.time[0]) / max(n - 1, 1) if n > 1 else 1.0
+        interval = (every.time[-1] - every.time[0]) / max(whole - 1, 1) if whole > 1 else 1.0
         start = each.time[first]
-        length = np.maximum(np.diff(start, append=each.time[-1] + interval), 1e-6)
+        length = np.maximum(np.diff(start, append=every.time[-1] + interval), 1e-6)
         B = block_covariance(start, length, noise.correlation_time)
         W = _weights(M, each, covariance[:-1, :-1], drift + coarse)
         J = np.concatenate([each.derivative, -each.truth[:, :, None]], axis=2)
@@ -486,7 +495,7 @@ def _form(
         Q = MWM * (each.white_variance + coarse)[:, None, :]
         white = white + _traces_of(Q) * [share, share**2 * each.correlated_samples / each.number]
         within_block = np.clip(each.wander_variance - np.diag(B)[label, None] * noise.wander**2, 0.0, None)
-        correlated = np.clip(noise.correlation_time / interval, 1.0, n / count) / n
+        correlated = np.clip(noise.correlation_time / interval, 1.0, whole / count) / whole
         within = within + _traces_of(MWM * within_block[:, None, :]) * [share, share**2 * correlated]
     A, Q = np.zeros((size, size)), np.zeros((3, size, size))
     A[:q, :q], at = of_parameters, q
@@ -556,11 +565,10 @@ def _factors(nu: float, noise: Noise, observed_s: float, *, upper: bool) -> tupl
 
 def _quantile(form: _QuadraticForm, factor: Values, weight: Values, probability: float) -> float:
     """Return a quantile of the mean squared error, mixed over factors (4, k) of probabilities (k,)."""
-    from scipy.optimize import brentq  # noqa: PLC0415  (as in _factors)
-    from scipy.special import gammainc, ndtr  # noqa: PLC0415
+    from scipy.special import gammainc, ndtr, ndtri  # noqa: PLC0415  (as in _factors)
 
     one, two, three = form.cumulants(factor)
-    spread = np.sqrt(two)
+    spread, goal = np.sqrt(two), float(ndtri(probability))
     h = np.minimum(8.0 * two**3 / np.maximum(three, 1e-300) ** 2, NORMAL_FREEDOM)
     half, root, normal = 0.5 * h, np.sqrt(2.0 * h), h >= NORMAL_FREEDOM
     some_normal = bool(normal.any())
@@ -570,9 +578,22 @@ def _quantile(form: _QuadraticForm, factor: Values, weight: Values, probability:
         below = gammainc(half, np.maximum(0.5 * (h + z * root), 0.0))
         if some_normal:
             below = np.where(normal, ndtr(z), below)
-        return float(weight @ below) - probability
+        return float(ndtri(min(max(float(weight @ below), 1e-300), 1.0 - 1e-16))) - goal
 
-    low, high = np.log(1e-6 * one.min()), np.log(float(np.max(one + 60.0 * spread)))
-    if excess(low) >= 0.0:
-        return float(np.exp(low))
-    return float(np.exp(brentq(excess, low, high, xtol=1e-12)))
+    # As a quantile of the normal distribution, the probability is nearly linear in the logarithm: the secant method,
+    # from the lognormal distribution of the same mean and variance; a step out of the bracket halves it.
+    low, high = float(np.log(1e-6 * one.min())), float(np.log(np.max(one + 60.0 * spread)))
+    mean = float(weight @ one)
+    width = float(np.sqrt(np.log(float(weight @ (two + one**2)) / mean**2)))
+    at, slope = float(np.log(mean)) + width * (goal - 0.5 * width), 1.0 / width
+    last, last_off = at, 0.0
+    for step in range(MAX_QUANTILE_STEPS):
+        off = excess(at)
+        low, high = (low, at) if off > 0.0 else (at, high)
+        slope = (off - last_off) / (at - last) if step and off != last_off else slope
+        last, last_off, at = at, off, at - off / slope
+        if not low - QUANTILE_STEP < at < high + QUANTILE_STEP:
+            at = 0.5 * (low + high)
+        if abs(at - last) < QUANTILE_STEP:
+            break
+    return float(np.exp(at))

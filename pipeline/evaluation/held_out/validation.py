@@ -232,28 +232,30 @@ def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[Lin
 
 
 def static_error(case: HeldOutCase) -> HeldOutError | None:
-    """Return the error of the mean of the static recording, and its interval as a held-out rest; None without one.
+    """Return the error of the mean of the static recording, and its interval as a held-out rest.
 
     The heading is unknown, so Earth's rotation widens the interval of a gyroscope twice: its component in the bias, and
-    its component in the recording are unknown.
+    its component in the recording are unknown. None without a recording, or where this alone explains the error.
     """
     static = {r.name: [Rest(0, r.samples)] for r in case.recordings if r.role == "static" and r.samples}
-    judged = last_error(case, [s for s in case.at_rests(static) if s.known.any()])
-    if judged is None or case.calibration.sensor == "accelerometer":
-        return judged
-    turning = 2.0 * EARTH_RATE_DPS
-    return replace(judged, low=max(judged.low - turning, 0.0), high=judged.high + turning)
+    turning = 2.0 * EARTH_RATE_DPS if case.calibration.sensor == "gyroscope" else 0.0
+    judged = last_error(case, [s for s in case.at_rests(static) if s.known.any()], explained=turning)
+    return judged and replace(judged, low=max(judged.low - turning, 0.0), high=judged.high + turning)
 
 
-def last_error(case: HeldOutCase, samples: Sequence[Samples]) -> HeldOutError | None:
-    """Return the rms error of samples after the last step and its interval; None without samples or interval."""
-    errors = [breakdown.last_error_of_magnitude(case.calibration, s) for s in samples]
-    parts = [breakdown.linearized(case.calibration, s) for s in samples if s.known.any()]
-    complete = [p for p in parts if p is not None]
-    if not complete or len(complete) < len(parts):
+def last_error(case: HeldOutCase, samples: Sequence[Samples], *, explained: float = -1.0) -> HeldOutError | None:
+    """Return the rms error of samples after the last step and its interval.
+
+    None without samples or interval, or if the error is not larger than ``explained``.
+    """
+    known = [s for s in samples if s.known.any()]
+    errors = [e for s in known if (e := breakdown.last_error_of_magnitude(case.calibration, s)) is not None]
+    if not errors or len(errors) < len(known):
         return None
-    error = np.concatenate([e for e in errors if e is not None])
-    return HeldOutError(float(np.sqrt(np.nanmean(error**2))), *_expected(case, samples, complete))
+    error = float(np.sqrt(np.nanmean(np.concatenate(errors) ** 2)))
+    parts = [breakdown.linearized(case.calibration, s) for s in known if error > explained]
+    complete = [p for p in parts if p is not None]
+    return HeldOutError(error, *_expected(case, samples, complete)) if complete else None
 
 
 def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> Agreement | None:
