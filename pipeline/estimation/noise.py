@@ -48,7 +48,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 import scipy
@@ -75,11 +74,10 @@ from pipeline.estimation.gauss_markov import (
     STATED_WIDTH,
     TIME_FACTORS,
     Blocks,
-    GaussMarkov,
-    Setting,
     WanderPrior,
     fast,
     orthonormal,
+    restricted_on_grid,
     variance_of_average,
 )
 from pipeline.physics.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
@@ -374,9 +372,9 @@ def _likelihood(blocks: _RestBlocks, design: Values, covariance: Values, times: 
     nu = max(float(np.sum(blocks.count - 1)) * correlated, 1e-9)
     cut = blocks.cut
     cut_blocks = Blocks(np.arange(cut.sum()), 1.0 / v[cut], blocks.start[cut], blocks.length[cut], blocks.clock[cut])
-    settings = _grid(*times.tolist())
     basis = orthonormal(design, v[cut], MIN_NUISANCE_SINGULAR_VALUE)
-    log_determinant, squares = GaussMarkov(cut_blocks, settings).restricted(basis, blocks.mean[cut])
+    means, times_s = blocks.mean[cut], times.tolist()
+    log_determinant, squares = restricted_on_grid(cut_blocks, times_s, SQRT_Q_GRID.tolist(), basis, means)
     inner = np.sum(blocks.count * (1.0 - variance_of_average(blocks.length, times[:, None])), axis=1)
     expected = within + np.outer(inner, SQRT_Q_GRID**2).ravel()
     free = len(cut_blocks.weight) - basis.shape[1] + nu
@@ -384,11 +382,6 @@ def _likelihood(blocks: _RestBlocks, design: Values, covariance: Values, times: 
     log_likelihood = -0.5 * ((log_determinant + nu * np.log(expected))[:, None] + free * np.log(variance))
     shape = (len(times), len(SQRT_Q_GRID), -1)
     return log_likelihood.reshape(shape), np.sqrt(variance).reshape(shape)
-
-
-@lru_cache(maxsize=8)  # sensor models of a batch
-def _grid(*times: float) -> tuple[Setting, ...]:
-    return tuple(Setting(ratio, tau) for tau in times for ratio in SQRT_Q_GRID.tolist())
 
 
 def noise_of(sensor: str, recordings: Sequence[Recording], data_sheet: DataSheet) -> Noise | None:

@@ -8,6 +8,7 @@ from scipy.integrate import dblquad
 
 from pipeline.core.records import Noise
 from pipeline.estimation.gauss_markov import (
+    BIAS_RATIO_GRID,
     SLOW_SPECTRUM_SHARE,
     STATED_WIDTH,
     Blocks,
@@ -18,6 +19,7 @@ from pipeline.estimation.gauss_markov import (
     block_covariance,
     constant_bias_s,
     orthonormal,
+    restricted_on_grid,
     variance_of_average,
 )
 
@@ -83,6 +85,21 @@ def test_the_restricted_likelihood_is_that_of_the_projected_values() -> None:
     ]
     np.testing.assert_allclose(squares, expected, rtol=1e-8)
     np.testing.assert_allclose(logarithm - logarithm[0], np.array(reference) - reference[0], atol=1e-8)
+
+
+def test_a_likelihood_between_the_computed_ratios_is_that_of_each_setting() -> None:
+    rng = np.random.default_rng(8)
+    m, times, ratios = 90, (25.0, 100.0, 400.0), BIAS_RATIO_GRID.tolist()
+    weight, length = rng.integers(60, 120, m).astype(float), rng.uniform(5.0, 9.0, m)
+    blocks = Blocks(np.arange(m), weight, np.cumsum(length) - length, length, np.repeat([0, 1], [60, 30]))
+    design = orthonormal(rng.standard_normal((m, 4)), 1.0 / weight, 1e-3)
+    wander = GaussMarkov(blocks, [Setting(0.3, 100.0)]).draw(rng, 2)
+    values = np.column_stack([wander, rng.standard_normal(m) / np.sqrt(weight), design[:, 0]])
+    found = restricted_on_grid(blocks, times, ratios, design, values)
+    expected = GaussMarkov(blocks, [Setting(q, tau) for tau in times for q in ratios]).restricted(design, values)
+    np.testing.assert_allclose(found[0], expected[0], atol=0.02)
+    np.testing.assert_allclose(found[1][:, :3], expected[1][:, :3], rtol=2e-3)
+    assert np.all(found[1][:, 3] < 1e-9)  # nothing but rounding is left of a column of the design
 
 
 def test_draws_have_the_dense_covariance() -> None:
