@@ -150,7 +150,7 @@ class ErrorMixture:
         size, inverse = np.ones(len(average)), np.zeros(len(average))
         variances = np.clip(np.diagonal(self.covariances, axis1=1, axis2=2)[:, known], 0.0, None)
         sigma = np.sqrt(variances / average[known])
-        inner, outer = (_within(self.weight, sigma, level) for level in (ONE_SIGMA, COVERED))
+        inner, outer = _within(self.weight, sigma, np.array([ONE_SIGMA, COVERED]))
         inverses, ratio, quantile = _quantiles()
         inverse[known] = np.interp(outer / inner, ratio, inverses)
         size[known] = outer / np.interp(inverse[known], inverses, quantile)
@@ -190,18 +190,18 @@ def root_of(covariance: Values) -> Values:
     return np.asarray(vectors * np.sqrt(np.clip(values, 0.0, None)))
 
 
-def _within(weight: Values, sigma: Values, probability: float) -> Values:
-    """Return the x with ``P(|e| < x) = probability`` of each mixture: (p,) array.
+def _within(weight: Values, sigma: Values, probability: Values) -> Values:
+    """Return the x with ``P(|e| < x)`` each of l probabilities, of each mixture: (l, p) array.
 
-    The probability is concave in x, so that Newton's method from below stays below.
+    The probability is concave in x, so that Newton's method from below stays below. It is concave in 1 / sigma, too:
+    the mean of these gives a start from below (Jensen's inequality).
     """
-    quantile = float(scipy.special.ndtri(0.5 + probability / 2.0))
-    sigma = np.maximum(sigma, 1e-9)
-    x, largest = quantile * sigma.min(axis=0), quantile * sigma.max(axis=0)
+    quantile, inverse = scipy.special.ndtri(0.5 + probability / 2.0)[:, None], 1.0 / np.maximum(sigma, 1e-9)
+    x, largest = quantile / (weight @ inverse), quantile / inverse.min(axis=0)
     for _ in range(MAX_NEWTON_STEPS):
-        ratio = x / sigma
-        density = weight @ (np.exp(-0.5 * ratio**2) / sigma) * np.sqrt(2.0 / np.pi)
-        step = (probability - weight @ (2.0 * scipy.special.ndtr(ratio) - 1.0)) / np.maximum(density, 1e-300)
+        ratio = x[:, None] * inverse
+        density = weight @ (np.exp(-0.5 * ratio**2) * inverse) * np.sqrt(2.0 / np.pi)
+        step = (probability[:, None] + 1.0 - 2.0 * (weight @ scipy.special.ndtr(ratio))) / np.maximum(density, 1e-300)
         x = np.minimum(x + step, largest)
         if (np.abs(step) <= SMALL_QUANTILE_STEP * x).all():
             break
@@ -272,35 +272,33 @@ class ResidualNoise:
 
     def posterior(self, fit: LinearMap) -> ErrorMixture:
         """Return the error of a fit's parameters."""
-        total = np.zeros((len(self.weight), fit.parameters, fit.parameters))
-        ratios = np.array([s.ratio**2 for s in self.settings])[:, None, None]
-        products = self._products(fit, [s.time for s in self.settings])
-        for J, variance, (white, slow) in zip(fit.derivative, self.white_variance.T, products, strict=True):
-            total += variance[:, None, None] * (J @ (white + ratios * slow) @ J.T)
+        times, at = np.unique([s.time for s in self.settings], return_inverse=True)
+        of_time = np.array([s.ratio**2 for s in self.settings])[:, None] * (at[:, None] == np.arange(len(times)))
+        share, total = np.column_stack([of_time, np.ones(len(at))]), np.zeros((len(at), *(fit.parameters,) * 2))
+        for J, s2, each in zip(fit.derivative, self.white_variance.T, self._products(fit, times.tolist()), strict=True):
+            total += np.tensordot(s2[:, None] * share, J @ each @ J.T, 1)
         return ErrorMixture(self.weight, total, self.spare)
 
     def variances(self, fit: LinearMap, prior: WanderPrior) -> tuple[Values, Values]:
         """Return the variances by the estimated white noise, and by the bias instability of a prior: (p,) arrays."""
-        white, wander = np.zeros(fit.parameters), np.zeros(fit.parameters)
-        for J, s, (alone, slow) in zip(fit.derivative, self.white, self._products(fit, [prior.time]), strict=True):
-            white += s**2 * np.einsum("pi,ij,pj->p", J, alone, J)
-            wander += prior.wander**2 * np.einsum("pi,ij,pj->p", J, slow[0], J)
-        return white, wander
+        pairs = zip(fit.derivative, self._products(fit, [prior.time]), strict=True)
+        each = np.stack([np.einsum("pi,tij,pj->tp", J, products, J) for J, products in pairs])
+        return self.white**2 @ each[:, 1], prior.wander**2 * each[:, 0].sum(axis=0)
 
     @cached_property
-    def _in_time(self) -> Callable[[float], Values]:
-        """B of the blocks at a correlation time."""
-        return cache(self.blocks.covariance)
+    def _in_time(self) -> dict[float, Values]:
+        """B of the blocks at correlation times."""
+        return {}
 
-    def _products(self, fit: LinearMap, times: Sequence[float]) -> list[tuple[Values, Values]]:
-        """Return ``A diag(1/n) A^T``, (q, q), and ``a B(tau) a^T`` at each time, (t, q, q), of each channel."""
-        products: dict[int, tuple[Values, Values]] = {}
-        for A in fit.weights:
-            if id(A) not in products:
-                a = self.blocks.sums(A.T)
-                slow = {tau: a.T @ self._in_time(tau) @ a for tau in set(times)}
-                white = (A if self.row_weight is None else A / self.row_weight) @ A.T
-                products[id(A)] = white, np.stack([slow[tau] for tau in times])
+    def _products(self, fit: LinearMap, times: Sequence[float]) -> list[Values]:
+        """Return ``a B(tau) a^T`` at each time, then ``A diag(1/n) A^T``, of each channel: (t + 1, q, q) arrays."""
+        if missing := [tau for tau in times if tau not in self._in_time]:
+            self._in_time.update(zip(missing, self.blocks.covariance(np.array(missing)), strict=True))
+        products: dict[int, Values] = {}
+        for key, A in {id(A): A for A in fit.weights}.items():
+            a = self.blocks.sums(A.T)
+            white = (A if self.row_weight is None else A / self.row_weight) @ A.T
+            products[key] = np.stack([*(a.T @ self._in_time[tau] @ a for tau in times), white])
         return [products[id(A)] for A in fit.weights]
 
 

@@ -189,24 +189,26 @@ def _half_average(length: Values, tau: float | Values) -> Values:
     return -np.expm1(-x) / x
 
 
-def block_covariance(start: Values, length: Values, tau: float) -> Values:
-    """Return B of blocks, all on one clock: (m, m) array.
+def block_covariance(start: Values, length: Values, tau: float | Values) -> Values:
+    """Return B of blocks, all on one clock: (m, m) array, or (t, m, m) for (t,) correlation times.
 
     For blocks [a, b] and [c, d] that overlap, ``B = (F(b - c) - F(a - c) - F(b - d) + F(a - d)) / ((b - a) (d - c))``
     with ``F(x) = tau^2 (exp(-|x| / tau) - 1) + tau |x|``, whose second derivative is the autocorrelation.
     """
-    half = _half_average(length, tau)
+    tau = np.asarray(tau)[..., None]
+    half, each = _half_average(length, tau), np.arange(len(start))
     centre = start + length / 2.0
     gap = np.abs(centre[:, None] - centre) - (length[:, None] + length) / 2.0
-    B: Values = np.exp(-np.maximum(gap, 0.0) / tau) * half[:, None] * half
-    np.fill_diagonal(gap, 0.0)
+    B: Values = np.exp(-np.maximum(gap, 0.0) / tau[..., None]) * half[..., :, None] * half[..., None, :]
+    gap[each, each] = 0.0
     if (overlapping := gap < -OVERLAP_S).any():
         rows, columns = np.nonzero(overlapping)
         one, two = (np.array([start[k], start[k] + length[k]]) for k in (rows, columns))
-        x = np.abs(one[:, None] - two) / tau
-        F = np.expm1(-x) + x
-        B[rows, columns] = tau**2 * (F[1, 0] - F[0, 0] - F[1, 1] + F[0, 1]) / (length[rows] * length[columns])
-    np.fill_diagonal(B, variance_of_average(length, tau))
+        x = np.abs(one[:, None] - two) / tau[..., None, None]
+        F = np.moveaxis(np.expm1(-x) + x, -1, -3)
+        second = F[..., 1, 0] - F[..., 0, 0] - F[..., 1, 1] + F[..., 0, 1]
+        B[..., rows, columns] = tau**2 * second / (length[rows] * length[columns])
+    B[..., each, each] = variance_of_average(length, tau)
     return B
 
 
@@ -260,8 +262,8 @@ class Blocks:
         """Return the sums of (n, p) columns over each block: (m, p) array."""
         return np.add.reduceat(columns, self.first, axis=0)
 
-    def covariance(self, tau: float) -> Values:
-        """Return B: (m, m) array."""
+    def covariance(self, tau: float | Values) -> Values:
+        """Return B: (m, m) array, or (t, m, m) for (t,) correlation times."""
         return np.asarray(block_covariance(self.start, self.length, tau) * (self.clock[:, None] == self.clock))
 
 
