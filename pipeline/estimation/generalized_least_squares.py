@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 
 import numpy as np
 
@@ -80,6 +81,8 @@ MAX_ITERATIONS = 25  # of Gauss-Newton
 SMALL_STEP_UNCERTAINTIES = 1e-3  # of a standard uncertainty
 BIAS_TO_WHITE_GRID = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)  # of bias to white noise: the grid of a fit
 CORRELATION_TIME_GRID_S = (30.0, 100.0, 300.0, 1000.0)  # s, correlation times of that grid
+# of log L below the likeliest noise: with any effect of 48 simulated sensors, a noise left out had a weight below 1e-4
+FAR_LESS_LIKELY = 25.0
 LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 3e-4 new
 
 
@@ -91,6 +94,9 @@ class JointFit(Start):
     covariance: Values
     log_likelihood: float  # under the best noise setting, up to a constant of the readings
     setting: Setting  # that noise setting
+    # settings under which a model with further effects may be likely. Effects explain signals that a model without them
+    # takes for noise. A setting of more noise (log det C) than the likeliest, and ``FAR_LESS_LIKELY``, is left out
+    likely: Sequence[Setting]
     degrees_of_freedom: float
     residual_rms: float  # of single samples, unit of the sensor
     rounds: int
@@ -162,6 +168,7 @@ def fit_terms(
         covariance=covariance,
         log_likelihood=solved.log_likelihood,
         setting=solved.setting,
+        likely=solved.likely,
         degrees_of_freedom=float(freedom.min()),
         residual_rms=float(np.sqrt(squares / (3.0 * noise.samples))),
         rounds=rounds,
@@ -213,6 +220,7 @@ class _SolvedStep:
     best_covariance: Values
     log_likelihood: float
     setting: Setting
+    likely: Sequence[Setting]
     condition: float
     cosine: float  # largest between a whitened column and the whitened residual, before the step
     rank: int
@@ -248,6 +256,7 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
         best_covariance=covariances[best],
         log_likelihood=float(scores[best]),
         setting=settings[best],
+        likely=[*compress(settings, (scores > scores[best] - FAR_LESS_LIKELY) | (logarithms < logarithms[best]))],
         condition=float(np.sqrt(values[best, -1] / max(values[best, 0], 1e-300))),
         cosine=float(np.max(np.abs(rhs[best]) / norm)),
         rank=int(kept[best].sum()),

@@ -44,7 +44,7 @@ from pipeline.estimation.evidence import (
     log_sum,
 )
 from pipeline.estimation.gates import MIN_ANSWER_PROBABILITY
-from pipeline.estimation.gauss_markov import WHITE_SETTING, random_walks
+from pipeline.estimation.gauss_markov import WHITE_SETTING
 from pipeline.estimation.generalized_least_squares import JointFit, design_at, fit_terms
 from pipeline.estimation.ranking import MIN_NEW_COLUMN_SHARE, without
 from pipeline.estimation.selection import DELAYS, Selection
@@ -444,8 +444,7 @@ def _products(
     if fit.terms or any(key not in places for key in keys):
         configured = fit.terms[: len(selection.base.terms)]
         design = design_at(selection.observations, fit, [*configured, *(term for _, term, _ in listed)])
-        walks = random_walks(selection.settings).values()
-        stacked, logarithms = design.products([WHITE_SETTING, *selection.settings, *walks])
+        stacked, logarithms = design.products([WHITE_SETTING, *selection.settings, *selection.walks])
         projected = without(stacked, np.arange(known))[:, known:, known:]
         return design.sizes(), stacked[:, :known, :known], projected, logarithms, design.slices[len(configured) :]
     base, projected = ranking.stacked[:, :known, :known], ranking.with_walks.copy()
@@ -461,7 +460,7 @@ def _problem(selection: Selection, fit: JointFit, candidates: Mapping[str, Effec
     listed = [(name, term, weight) for name, each in versions.items() for term, weight in each]
     known = BASE_COUNT + sum(len(term.values) for term in configured)
     size, base, products, logarithms, places = _products(selection, fit, listed, known)
-    settings = [WHITE_SETTING, *selection.settings, *random_walks(selection.settings).values()]
+    settings = [WHITE_SETTING, *selection.settings, *selection.walks]
     size = np.where(size > 0.0, size, 1.0)
     base = base / np.outer(size[:known], size[:known])
     prior = np.array([s.prior for s in settings]) - 0.5 * (logarithms + np.linalg.slogdet(base)[1])

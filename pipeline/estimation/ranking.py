@@ -19,7 +19,7 @@ from pipeline.core.records import BASE_COUNT, Index, Values, standard_uncertaint
 from pipeline.estimation.candidates import estimates
 from pipeline.estimation.design import Design, EffectColumns, Start, Terms
 from pipeline.estimation.gates import within
-from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting, random_walks
+from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
 from pipeline.estimation.observations import Observations
 
 MIN_NEW_COLUMN_SHARE = 1e-3  # share of a column's norm, after projection of the base, from which on it is determined
@@ -60,9 +60,10 @@ class Ranking:
 
     Fitted effects are at their values, others at each of their starts: one effect may have several candidates.
 
-    ``base``: the fit of base and configured effects. ``candidates``: by name. Attributes of each candidate: ``spans``,
-    its columns in ``projected``, the products after projection; ``blocks``, its excited directions, (k, r), scaled to
-    unit norm under white noise; ``places``, these directions in ``products``. The readings come last.
+    ``base``: the fit of base and configured effects. ``candidates``: by name. ``walks``: further settings, for the
+    posterior at the same fit. Attributes of each candidate: ``spans``, its columns in ``projected``, the products after
+    projection; ``blocks``, its excited directions, (k, r), scaled to unit norm under white noise; ``places``, these
+    directions in ``products``. The readings come last.
     """
 
     def __init__(
@@ -72,6 +73,8 @@ class Ranking:
         fit: Start,
         candidates: Mapping[str, EffectColumns],
         settings: Sequence[Setting],
+        *,
+        walks: Sequence[Setting] = (),
     ) -> None:
         self.settings = [WHITE_SETTING, *settings]
         self.samples = 3.0 * observations.samples
@@ -86,7 +89,6 @@ class Ranking:
                 self.candidates += [EffectColumns(term.effect, values) for values in starts]
         configured = [replace(fitted[term.effect.name], full=True) for term in base.terms]
         design = Design(observations, [*configured, *self.candidates], fit.K, fit.scale, project=True)
-        walks = [] if fit.terms else random_walks(settings).values()  # for the posterior at the same fit
         self.stacked, self.logarithms = design.products([*self.settings, *walks])
         self.sizes, self.slices, of_settings = design.sizes(), design.slices, slice(len(self.settings))
         self.penalty = 0.5 * self.logarithms[of_settings] - np.array([setting.prior for setting in self.settings])

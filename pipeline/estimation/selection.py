@@ -27,7 +27,7 @@ from pipeline.estimation.candidates import candidates_for, estimates, limits_of,
 from pipeline.estimation.design import EffectColumns, Start, Terms, ordinary_base, placed, without_unknown_motion
 from pipeline.estimation.engine import scaled_inverse
 from pipeline.estimation.gates import MAX_FALSE_PROBABILITY, MIN_DELTA_BIC, passes
-from pipeline.estimation.gauss_markov import Setting, selection_grid
+from pipeline.estimation.gauss_markov import Setting, random_walks, selection_grid
 from pipeline.estimation.generalized_least_squares import (
     SMALL_STEP_UNCERTAINTIES,
     JointFit,
@@ -89,8 +89,10 @@ def select(
         starts, candidates = models(observations)
         start, limits = ordinary_base(observations, noise), limits_of(observations.sensor, data_sheet)
         base = fit_best(observations, starts, start, grid)
-        ranking = Ranking(observations, base, base, candidates, grid)
-        given = observations, noise, data_sheet, start, grid, limits, candidates
+        settings = base.likely if search else grid
+        walks = [walk for setting, walk in random_walks(grid).items() if setting in settings]
+        ranking = Ranking(observations, base, base, candidates, settings, walks=() if base.terms else walks)
+        given = observations, noise, data_sheet, start, settings, walks, limits, candidates
         selection = Selection(*given, base, base, ranking, ranking, near=near)
         if search:
             selection.run()
@@ -114,7 +116,8 @@ class Selection:
     noise: Noise | None
     data_sheet: DataSheet
     start: Start
-    settings: list[Setting]
+    settings: Sequence[Setting]  # of the noise: those under which base and effects may be likely
+    walks: Sequence[Setting]  # their random walks of the bias, of the posterior
     limits: dict[str, Values]
     candidates: dict[str, EffectColumns]  # before any fit, with their priors
     base: JointFit  # base and configured effects

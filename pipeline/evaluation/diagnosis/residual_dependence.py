@@ -95,8 +95,8 @@ def dependences(selection: Selection, explained: Curves | None = None) -> list[D
     if any(effect(name).uses_time_or_temperature for name in selection.names):
         least = MAX_SHARE_OF_LINEARISATION * 2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood)
         found = {k: v for k, v in found.items() if v[0] > least or k not in ("temperature", "time")}
-    if found and any(setting.prior for setting in selection.settings):
-        least = min(setting.prior for setting in selection.settings)
+    least = min(setting.prior for setting in selection_grid(selection.noise))
+    if found and least:
         free = [setting._replace(prior=least) for setting in selection_grid(None)]
         unconstrained = _significant(replace(selection, settings=[*selection.settings, *free]), explained)
         found = {name: values for name, values in unconstrained.items() if name in found}
