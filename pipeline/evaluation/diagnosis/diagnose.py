@@ -48,6 +48,7 @@ from pipeline.core.records import (
     SensorValidation,
     Values,
     median,
+    once,
 )
 from pipeline.core.settings import Effects, Settings, Table, Uncertainty
 from pipeline.core.verdicts import Verdict, decided_words
@@ -480,13 +481,19 @@ def _density(parts: Sequence[tuple[float, Values]], time: float) -> float | None
 
 def _motion(recordings: Sequence[Recording]) -> dict[str, float | None]:
     """Return the extent of held-out motion by the readings."""
-    rates = [_squared_lengths(r.gyroscope, np.nanmedian) for r in recordings if r.gyroscope is not None]
-    forces = [_squared_lengths(r.accelerometer, np.nanmean) for r in recordings if r.accelerometer is not None]
-    rms = [float(np.sqrt(np.nanmean(np.concatenate(v)))) if v else None for v in (rates, forces)]
+    squares = ([_squares(r, sensor) for r in recordings] for sensor in ("gyroscope", "accelerometer"))
+    totals = [np.sum(each, axis=0).tolist() for each in squares]
+    rms = [float(np.sqrt(total / count)) if count else None for total, count in totals]
     duration = float(sum(r.time[-1] - r.time[0] for r in recordings))
     return {"rate_dps": rms[0], "force_change_g": rms[1], "duration_s": duration}
 
 
-def _squared_lengths(readings: Values, centre: Callable[..., Values]) -> Values:
-    """Return the squared lengths of readings less their centre: (n,) array."""
-    return np.asarray(np.sum((readings - centre(readings, axis=0)) ** 2, axis=1))
+@once
+def _squares(recording: Recording, sensor: str) -> tuple[float, int]:
+    """Return the sum of the squared lengths of readings less their centre, and the number of readings."""
+    readings = recording.reading(sensor)
+    if readings is None:
+        return 0.0, 0
+    centre = (np.nanmedian if sensor == "gyroscope" else np.nanmean)(readings, axis=0)
+    squares = np.sum((readings - centre) ** 2, axis=1)
+    return float(np.nansum(squares)), int(np.isfinite(squares).sum())
