@@ -29,8 +29,8 @@ def test_members_are_read_as_they_were_written_and_written_the_same_again(tmp_pa
     assert "U2.json" not in pack
 
 
-def test_pages_that_are_published_one_by_one_are_not_deflated(tmp_path: Path) -> None:
-    with new_pack(tmp_path / "report.zip", (".html",)) as add:
+def test_files_that_are_published_one_by_one_are_not_deflated(tmp_path: Path) -> None:
+    with new_pack(tmp_path / "report.zip", deflated=False) as add:
         add({name: as_bytes(FILES[name]) for name in ("U1.html", "U1.json")})
     assert as_bytes(FILES["U1.html"]) in (tmp_path / "report.zip").read_bytes()
     assert Pack(tmp_path / "report.zip").read("U1.html") == as_bytes(FILES["U1.html"])

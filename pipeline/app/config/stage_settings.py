@@ -149,13 +149,12 @@ def _content(
         stated = summaries[row.name] if stage == "summary" else _stated(row, stage, run, board)
         settings[row.name] = settings_of_unit(row, stage, sensor, stated)
     content: dict[str, Any] = dict(zip(("common", "units"), in_common(settings), strict=True))
+    content["packed"] = campaign.packed
     content |= effects_for(stage, sensor, [r.config for r in rows])
     if sensor:
         content["last"] = {row.name: last_stage(row.config, sensor) for row in rows}
     if stage in ("ingest", "report"):
         content["campaign"] = campaign.name
-    if stage == "report":
-        content["packed"] = campaign.packed
     if stage == "ingest":
         content |= {"directory": str(campaign.recorded), "recordings": _recordings(campaign, rows)}
     return content

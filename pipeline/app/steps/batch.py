@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -27,7 +26,7 @@ from typing import Any
 from pipeline.app.results_folder import hold_as_job, record_written, repetitions
 from pipeline.app.steps import MODULES
 from pipeline.core.errors import DamagedFileError, PipelineError, failure_of, is_of_run, omission
-from pipeline.core.files import read_json, write_json
+from pipeline.core.files import json_text, read_json, write_json
 from pipeline.core.pack import FAILED_SUFFIX, INCOMPLETE_SUFFIX, Files, Pack, as_bytes, new_pack
 from pipeline.core.settings import Settings, UserEffectFiles
 from pipeline.unit import EFFECTS_STAGE, STEPS, Task, run_step
@@ -112,7 +111,7 @@ def main(stage: str, argv: Sequence[str]) -> int:
         return 0
     edited = job.run.get("again", 0) != repetitions(job.results, _below(job, job.output))[0]
     last = None if edited else Pack(last_output(job.output))
-    with new_pack(job.output, (".parquet",) if job.run.get("packed", True) else (".parquet", ".html")) as add:
+    with new_pack(job.output, deflated=job.run.get("packed", True)) as add:
         for number, (unit, settings) in enumerate(job.units.items(), 1):
             print(f"{stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
             inputs = _inputs_of(module, job, unit, settings)
@@ -153,7 +152,7 @@ def _inputs_of(module: ModuleType, job: Job, unit: str, settings: Settings) -> s
         found = [run, job.content[unit], job.state_of_members(unit), others]
     except PipelineError:
         return ""
-    return "" if others is None else hashlib.sha256(json.dumps(found, sort_keys=True).encode()).hexdigest()
+    return "" if others is None else hashlib.sha256(json_text(found, 0).encode()).hexdigest()
 
 
 def _unchanged(last: Pack, unit: str, inputs: str) -> dict[str, bytes]:
