@@ -40,7 +40,7 @@ from pipeline.checks.evidence import LEAST_RATE_DPS, axis_index, place, quantile
 from pipeline.core.records import SENSOR_UNITS, SENSORS, Integers, Mask, Note, Recording, Values, median, once
 from pipeline.core.settings import DataSheet, Sensor, Settings
 from pipeline.physics.kinematics import EARTH_RATE_DPS
-from pipeline.physics.signal.rests import RATE_AT_REST, RATE_AT_REST_DPS, rests_from_table, runs
+from pipeline.physics.signal.rests import RATE_AT_REST, RATE_AT_REST_DPS, runs, still_on_table
 
 REST_BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16  # shorter than a knock with its decay; samples, for a standard deviation
 # samples of a rest, and rests of a recording, that determine the usual scatter
@@ -237,7 +237,7 @@ def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
     for recording in recordings:
         if recording.role == "static" or recording.axis is None:
             continue
-        rows = np.concatenate([np.arange(0), *(np.arange(r.start, r.stop) for r in rests_from_table(recording))])
+        rows = np.flatnonzero(still_on_table(recording))
         angle = np.zeros(len(rows)) if recording.table_angle is None else recording.table_angle[rows]
         stepped = np.abs(np.diff(angle)) > STEPPED_DEG  # the table moved between two samples
         ends = np.append(np.flatnonzero((np.diff(rows) > 1) | stepped) + 1, len(rows))

@@ -25,8 +25,9 @@ with ``nu = 3 (n - 1)``, m the mean of the piece and s the median scatter of an 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -183,12 +184,16 @@ class _Motion:
             rate = np.zeros((recording.samples, 1))
         self.rate = rate
         self.still = STILL_BY_HAND_DEG if self.by_hand else STILL_DEG
-        dt = recording.time_steps
+
+    @cached_property
+    def sums(self) -> Sequence[Values]:
+        """Angle turned, deg, changes of the rate, deg/s, and of the pull at the lever arm, g, up to each sample."""
+        rate, dt = self.rate, self.recording.time_steps
         turned = 0.5 * np.linalg.norm(rate[1:] + rate[:-1], axis=1) * dt
         changed = np.linalg.norm(rate[1:] - rate[:-1], axis=1)
         speed = np.linalg.norm(rate, axis=1)
         pulled = (np.radians(changed) / dt + np.abs(np.diff(np.radians(speed) ** 2))) * LEVER_M / STANDARD_GRAVITY
-        self.turned, self.changed, self.pulled = (np.append(0.0, np.cumsum(v)) for v in (turned, changed, pulled))
+        return [np.append(0.0, np.cumsum(v)) for v in (turned, changed, pulled)]
 
     def _rate(self) -> Values | None:
         """Return the rate: (n, 1) or (n, 3) array, deg/s; None if it is unknown."""
@@ -227,24 +232,25 @@ class _Motion:
         low, high = np.maximum(n - self.half, 0), np.minimum(n + self.half, len(n) - 1)
         if self.unknown or (self.by_hand and sensor == "gyroscope"):
             return np.full(len(n), np.inf)
+        summed, changed, pulled = self.sums
         if sensor == "gyroscope":
-            return np.asarray(self.changed[high] - self.changed[low])
-        turned = self.turned[high] - self.turned[low]
+            return np.asarray(changed[high] - changed[low])
+        turned = summed[high] - summed[low]
         late = max(1, round(LATE_S / self.recording.interval))
-        soon = self.turned[np.minimum(n + late, n[-1])] - self.turned[np.maximum(n - late, 0)]
+        soon = summed[np.minimum(n + late, n[-1])] - summed[np.maximum(n - late, 0)]
         most = np.max([soon[low], soon, soon[high]], axis=0)
-        change = np.radians(np.minimum(most, turned)) + self.pulled[high] - self.pulled[low]
+        change = np.radians(np.minimum(most, turned)) + pulled[high] - pulled[low]
         return np.where(turned > STILL_BY_HAND_DEG, np.inf, change) if self.by_hand else change
 
     def around(self, n: int) -> tuple[slice, bool]:
         """Return the samples around n, of the same rest or in motion the nearest, and whether they are at rest."""
-        last = self.recording.samples - 1
+        last, turned = self.recording.samples - 1, self.sums[0]
         for far in (self.long, self.long // 2, self.half):
             a, b = max(n - far, 0), min(n + far, last)
-            if self.turned[b] - self.turned[a] <= self.still:
+            if turned[b] - turned[a] <= self.still:
                 return slice(a, b + 1), True
-        a = max(int(np.searchsorted(self.turned, self.turned[n] - self.still)), n - self.long)
-        b = min(int(np.searchsorted(self.turned, self.turned[n] + self.still, "right")), n + self.long)
+        a = max(int(np.searchsorted(turned, turned[n] - self.still)), n - self.long)
+        b = min(int(np.searchsorted(turned, turned[n] + self.still, "right")), n + self.long)
         if b - a >= self.half:
             return slice(a, b), True
         return slice(max(n - self.half, 0), min(n + self.half, last) + 1), False

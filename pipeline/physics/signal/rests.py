@@ -123,16 +123,21 @@ def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> M
 
 
 @once
+def still_on_table(recording: Recording) -> Mask:
+    """Return which samples are in the rests of ``rests_from_table``: (n,) array of bool."""
+    rate = recording.logged_rate
+    if rate is None:
+        return np.zeros(recording.samples, bool)
+    return still_samples(recording.time, rate, SETTLING_S + float(recording.filter.get("delay_s", 0.0)))
+
+
+@once
 def rests_from_table(recording: Recording) -> list[Rest]:
     """Return the rests by the rate of the table, or by the derivative of its angle; none without such a log.
 
     Their first 0.3 s, and the delay of the recording's filter, are not included.
     """
-    rate = recording.logged_rate
-    if rate is None:
-        return []
-    still = still_samples(recording.time, rate, SETTLING_S + float(recording.filter.get("delay_s", 0.0)))
-    return [Rest(start, stop) for start, stop in runs(still)]
+    return [Rest(start, stop) for start, stop in runs(still_on_table(recording))]
 
 
 @once
