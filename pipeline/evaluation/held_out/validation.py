@@ -169,7 +169,9 @@ def validate(
             notes += [EARTH_LEFT_OUT] if any(s.earth_left_out for s in samples) else []
             if part.held_out:
                 agreement = _agreement(case, samples, complete)
-                part = replace(part, agreement=agreement, worse_than_raw=_worse_than_raw(case, samples, expected[1]))
+                part = replace(
+                    part, agreement=agreement, worse_than_raw=_worse_than_raw(case, samples, steps, expected[1])
+                )
         else:
             names = breakdown.left_out(calibration, samples)
             verb = "is" if len(names) == 1 else "are"
@@ -351,17 +353,19 @@ def _fitted_exactly(calibration: SensorCalibration) -> int:
     return 0
 
 
-def _worse_than_raw(case: HeldOutCase, samples: Sequence[Samples], allowed: float) -> str | None:
+def _worse_than_raw(
+    case: HeldOutCase, samples: Sequence[Samples], steps: Sequence[StepErrors], allowed: float
+) -> str | None:
     """Return why a calibration must not be used, as one sentence; None where it may be used."""
+    sizes = [step.rms_error or 0.0 for step in (steps[0], steps[-1])]
+    if sizes[1] <= max(sizes[0], allowed):
+        return None
     errors = [breakdown.last_error_of_magnitude(case.calibration, s) for s in samples]
     after = [error[s.known] for error, s in zip(errors, samples, strict=True) if error is not None]
-    if len(after) < len(samples):
+    if len(after) < len(samples) or sum(map(len, after)) < MIN_T_TEST_SAMPLES:
         return None
     raw = np.concatenate([(length(s.reading) - s.magnitude)[s.known] for s in samples])
     calibrated = np.concatenate(after)
-    sizes = [float(np.sqrt(np.mean(e**2))) for e in (raw, calibrated)]
-    if sizes[1] <= max(sizes[0], allowed) or len(raw) < MIN_T_TEST_SAMPLES:
-        return None
     pieces = np.array_split(calibrated**2 - raw**2, min(STRETCHES, len(raw)))
     means = np.array([piece.mean() for piece in pieces])
     from scipy.special import stdtrit  # noqa: PLC0415  (only where the calibration seems to be worse)
@@ -466,19 +470,14 @@ def _fitted(calibration: SensorCalibration, part: str, left: Values, truth: Valu
     if not known.all():
         left, truth = left[known], truth[known]
     reading = left @ K.T  # minus the bias
-    ones = np.ones((len(reading), 1))
-    if part == "none" or _spread(reading) < LEAST_SPREAD_G:
-        offset = np.mean(truth - reading @ matrix.T, axis=0)
-    elif part == "full":
-        *rows, offset = np.linalg.lstsq(np.hstack([reading, ones]), truth, rcond=None)[0]
-        matrix = np.array(rows).T
-    else:
-        pairs = [np.linalg.lstsq(np.hstack([reading[:, [i]], ones]), truth[:, i], rcond=None)[0] for i in range(3)]
-        matrix, offset = np.diag([p[0] for p in pairs]), np.array([p[1] for p in pairs])
-    return calibration.bias - np.linalg.solve(matrix, offset), matrix
+    mean, mean_truth = reading.mean(axis=0), truth.mean(axis=0)
+    off, change = reading - mean, truth - mean_truth
+    if part != "none" and _spread(off) >= LEAST_SPREAD_G:
+        diagonal = np.diag(np.sum(off * change, axis=0) / np.sum(off**2, axis=0))
+        matrix = np.linalg.lstsq(off, change, rcond=None)[0].T if part == "full" else diagonal
+    return calibration.bias + mean - np.linalg.solve(matrix, mean_truth), matrix
 
 
-def _spread(values: Values) -> float:
-    """Return the least rms deviation of (n, 3) values from their mean along any direction."""
-    off = values - values.mean(axis=0)
+def _spread(off: Values) -> float:
+    """Return the least rms deviation along any direction, of (n, 3) deviations from the mean."""
     return float(np.sqrt(max(np.linalg.eigvalsh(off.T @ off)[0], 0.0) / len(off)))
