@@ -228,7 +228,8 @@ def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | N
             hint = "one of them has to go: write orientation,XYZ in the file, or set sensor.axis_map=[+x,+y,+z]"
             raise IngestError(message, table.path, code="gcsv", hint=hint)
         maps = dict.fromkeys(TRIADS, map_of_orientation(stated))
-    left_handed = [s for s, m in maps.items() if np.linalg.det(axis_matrix(m)) < 0 and TRIADS[s][0] in values]
+    turned = {s: axis_matrix(m) for s, m in maps.items() if m != STRAIGHT and TRIADS[s][0] in values}
+    left_handed = [s for s, matrix in turned.items() if np.linalg.det(matrix) < 0]
     if left_handed:  # not a rotation: some sensors have left-handed axes, so that the map is used
         detail = ", ".join(f"[{', '.join(maps[s])}] of the {s}" for s in left_handed)
         notes.insert(0, Note("N-LEFTHANDED", len(left_handed), 0, 0, f"left-handed axis map: {detail}"))
