@@ -46,7 +46,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 
 import numpy as np
 import scipy
@@ -285,20 +285,13 @@ class ResidualNoise:
         each = np.stack([np.einsum("pi,tij,pj->tp", J, products, J) for J, products in pairs])
         return self.white**2 @ each[:, 1], prior.wander**2 * each[:, 0].sum(axis=0)
 
-    @cached_property
-    def _in_time(self) -> dict[float, Values]:
-        """B of the blocks at correlation times."""
-        return {}
-
     def _products(self, fit: LinearMap, times: Sequence[float]) -> list[Values]:
         """Return ``a B(tau) a^T`` at each time, then ``A diag(1/n) A^T``, of each channel: (t + 1, q, q) arrays."""
-        if missing := [tau for tau in times if tau not in self._in_time]:
-            self._in_time.update(zip(missing, self.blocks.covariance(np.array(missing)), strict=True))
-        products: dict[int, Values] = {}
+        B, products = self.blocks.covariance(np.array(times)), dict[int, Values]()
         for key, A in {id(A): A for A in fit.weights}.items():
             a = self.blocks.sums(A.T)
             white = (A if self.row_weight is None else A / self.row_weight) @ A.T
-            products[key] = np.stack([*(a.T @ self._in_time[tau] @ a for tau in times), white])
+            products[key] = np.concatenate([a.T @ B @ a, white[None]])
         return [products[id(A)] for A in fit.weights]
 
 

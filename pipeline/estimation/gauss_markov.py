@@ -50,7 +50,6 @@ RANDOM_WALK = 8.0  # correlation time over the measured one, with the same varia
 # A random walk of the bias: factors on ratio and time of a setting, and its share of that setting's prior. Of 80
 # simulated random walks 17 showed an invented effect without it, and 6 with it.
 WALK_RATIO, WALK_TIME, WALK_SHARE = 8.0, 64.0, 0.3
-ROUNDING = 1e-15  # of the largest square, below which others are rounding
 LARGEST_SPAN = 1e9  # of variances that a factorisation resolves: 1e7 times the rounding of a double
 # share of white noise's spectrum, see ``constant_bias_s``: right answers as with 0.05 in the blind study
 SLOW_SPECTRUM_SHARE = 0.3
@@ -205,9 +204,8 @@ def block_covariance(start: Values, length: Values, tau: float | Values) -> Valu
         rows, columns = np.nonzero(overlapping)
         one, two = (np.array([start[k], start[k] + length[k]]) for k in (rows, columns))
         x = np.abs(one[:, None] - two) / tau[..., None, None]
-        F = np.moveaxis(np.expm1(-x) + x, -1, -3)
-        second = F[..., 1, 0] - F[..., 0, 0] - F[..., 1, 1] + F[..., 0, 1]
-        B[..., rows, columns] = tau**2 * second / (length[rows] * length[columns])
+        F = (np.expm1(-x) + x) * np.array([[-1.0, 1.0], [1.0, -1.0]])[..., None]
+        B[..., rows, columns] = tau**2 * F.sum(axis=(-3, -2)) / (length[rows] * length[columns])
     B[..., each, each] = variance_of_average(length, tau)
     return B
 
@@ -391,43 +389,36 @@ def restricted_on_grid(
 ) -> tuple[Values, Values]:
     """Return ``GaussMarkov.restricted`` at each of t times with each of r rising ratios: (t r,) and (t r, c) arrays.
 
-    Both are sums over the spectrum of C in which 1 + q e with e >= 0 occurs, so that their logarithms are smooth in
-    log q: they are interpolated between fewer ratios. Squares fall with q, and so stay between those of the knots.
+    log det and log squares are smooth in log q: C has the spectrum 1 + q e with e >= 0, in units of v. They are
+    interpolated between fewer ratios. Both are monotone in q, and so stay between those of the knots.
     """
     knots, weights = _knots(tuple(ratios))
-    of_blocks = np.stack([blocks.weight, blocks.start, blocks.length, blocks.clock])
-    logarithm, squares = _model(of_blocks.tobytes(), tuple(times), tuple(knots)).restricted(design, values)
-    least = np.maximum(ROUNDING * squares.max(axis=0, initial=0.0), np.finfo(float).tiny)
-    known = np.column_stack([logarithm, np.log(np.maximum(squares, least))]).reshape(len(times), len(knots), -1)
+    of_blocks = np.stack([blocks.weight, blocks.start, blocks.length, blocks.clock]).tobytes()
+    logarithm, squares = _model(of_blocks, tuple(times), tuple(knots)).restricted(design, values)
+    known = np.column_stack([logarithm, np.log(np.maximum(squares, np.finfo(float).tiny))])
+    known = known.reshape(len(times), len(knots), -1)
     found = np.clip(weights @ known, known.min(axis=1, keepdims=True), known.max(axis=1, keepdims=True))
-    found = found.reshape(-1, found.shape[2])
-    return found[:, 0], np.exp(found[:, 1:])
+    return found[..., 0].ravel(), np.exp(found[..., 1:]).reshape(-1, squares.shape[1])
 
 
 @lru_cache(maxsize=1)  # both sensors of a recording have the same blocks
 def _model(of_blocks: bytes, times: tuple[float, ...], ratios: tuple[float, ...]) -> GaussMarkov:
     """Return C at each time with each ratio; ``of_blocks``: weight, start, length and clock of the blocks."""
     columns = np.frombuffer(of_blocks).reshape(4, -1)
-    blocks = Blocks(np.arange(columns.shape[1]), *columns)
-    return GaussMarkov(blocks, [Setting(ratio, tau) for tau in times for ratio in ratios])
+    settings = [Setting(ratio, tau) for tau in times for ratio in ratios]
+    return GaussMarkov(Blocks(np.arange(columns.shape[1]), *columns), settings)
 
 
 @lru_cache(maxsize=4)  # grids of ratios
 def _knots(ratios: tuple[float, ...]) -> tuple[list[float], Values]:
-    """Return k ratios of about ``KNOT_STEP``, and the (r, k) weights of the natural quintic spline through them.
-
-    A ratio of 0 is one of them.
-    """
+    """Return k ratios, also 0 if it is one, and the (r, k) weights of the natural quintic spline through them."""
     x = np.log([ratio for ratio in ratios if ratio > 0.0])
     at = np.linspace(x[0], x[-1], 1 + math.ceil((x[-1] - x[0]) / KNOT_STEP))
     at = np.sort(np.append(at, [at[:2].mean(), at[-2:].mean()]))  # a natural spline bends too little at its ends
-
-    def basis(x: Values) -> Values:
-        return np.column_stack([np.abs(x[:, None] - at) ** 5, np.vander(x, 3)])
-
-    conditions = np.vstack([basis(at), np.column_stack([np.vander(at, 3).T, np.zeros((3, 3))])])
-    weights = (basis(x) @ np.linalg.inv(conditions))[:, : len(at)]
-    zero = len(ratios) - len(x)
+    k, zero, both = len(at), len(ratios) - len(x), np.append(at, x)
+    basis = np.column_stack([np.abs(both[:, None] - at) ** 5, np.vander(both, 3)])
+    conditions = np.vstack([basis[:k], np.pad(basis[:k, k:].T, ((0, 0), (0, 3)))])
+    weights = (basis[k:] @ np.linalg.inv(conditions))[:, :k]
     return [0.0] * zero + np.exp(at).tolist(), scipy.linalg.block_diag(np.eye(zero), weights)
 
 

@@ -76,8 +76,8 @@ def fit(task: StageInput, *, details: bool = True) -> SensorCalibration:
     y, u = (np.add.reduceat(of_samples, first, axis=0) / count[:, None] for of_samples in (readings, truths))
     X = np.column_stack([np.ones(len(u)), u])
     weighted = root * X
-    condition, rank = _require_observable(sensor, X, weighted), X.shape[1]
     factors = ScaledColumns.of(weighted)
+    condition, rank = _require_observable(sensor, factors, X), X.shape[1]
     beta = factors.solve(root * y)
     residuals = readings - beta[0] - truths @ beta[1:]
     bias, K = beta[0], beta[1:].T
@@ -140,15 +140,15 @@ def _reference(sensor: str, part: TurnPart) -> Values:
         return truth(sensor, late or motion)
 
 
-def _require_observable(sensor: str, X: Values, weighted: Values) -> float:
+def _require_observable(sensor: str, factors: ScaledColumns, X: Values) -> float:
     """Return the condition of the columns, in units of the largest motion; raise if one is not determined.
 
-    ``weighted``: (n, 4), X times the root of the samples of each row.
+    ``factors``: of X times the root of the samples of each row.
     """
     size = float(np.max(length(X[:, 1:])))
-    units = np.linalg.norm(weighted[:, 0]) * np.array([1.0, size, size, size])
-    triangle = np.asarray(np.linalg.qr(weighted / units, mode="r"), np.float64)  # of the same singular values
-    columns = ScaledColumns.of(triangle, MIN_DESIGN_SINGULAR_VALUE, np.ones(len(units)))
+    units = factors.scale[0] * np.array([1.0, size, size, size])
+    rotated = factors.singular[:, None] * factors.Vt * (factors.scale / units)  # of the same singular values
+    columns = ScaledColumns.of(rotated, MIN_DESIGN_SINGULAR_VALUE, np.ones(len(units)))
     if lost := columns.undetermined(PARAMETER_COLUMNS, PART_OF_IT):
         raise NotObservableError(
             f"{sensor}: the recordings do not determine {', '.join(lost)}"
