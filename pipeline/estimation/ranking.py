@@ -117,6 +117,7 @@ class Ranking:
             if len(self.places[j]) > 0:
                 self._excited.setdefault(term.effect.name, []).append(j)
         self._with: dict[tuple[int, ...], Values] = {}  # log L of selected candidates and one more, from ``scores``
+        self._explained: dict[int, float] = {}  # see ``explained``
 
     def indices(self, name: str) -> list[int]:
         """Return the indices of the candidates of an effect that the motion excites."""
@@ -184,7 +185,10 @@ class Ranking:
         ridge = UNIT_COLUMN_RIDGE * np.stack([squares[:, at] for at in places])
         definite = inner + ridge[..., None] * np.eye(inner.shape[-1])
         solved = np.linalg.solve(definite, cross[..., None])[..., 0]
-        rss = products[:, -1, -1] - np.sum(cross * solved, axis=2)
+        explained = np.sum(cross * solved, axis=2)
+        rss = products[:, -1, -1] - explained
+        if products is self.products:
+            self._explained |= zip(members, explained[:, 0].tolist(), strict=True)
         likelihood = self.log_likelihood(rss)
         weakest = np.linalg.eigvalsh(inner[:, 0])[:, 0]
         likeliest, row = np.argmax(likelihood[:, 1:], axis=1) + 1, np.arange(len(members))
@@ -192,9 +196,10 @@ class Ranking:
         linear, variance = (blocks @ signals[..., None])[..., 0], np.maximum(rss[row, likeliest], 0.0) + self.within
         covariances = blocks @ np.linalg.solve(definite[row, likeliest], blocks.transpose(0, 2, 1))
         uncertainties = standard_uncertainty(covariances * (variance / self.samples)[:, None, None])
-        of_one = float(np.log(self.samples))
+        of_white = 2.0 * cross[:, 0] - (inner[:, 0] @ signals[..., None])[..., 0]
+        of_one, drops = float(np.log(self.samples)), np.sum(signals * of_white, axis=1).tolist()
         for i, j in enumerate(members):
-            term, this, best, signal = self.candidates[j], self.candidates[j].effect, int(likeliest[i]), signals[i]
+            term, this, best = self.candidates[j], self.candidates[j].effect, int(likeliest[i])
             k = inner.shape[-1] + (0 if this.moves else len(this.nonlinear))
             gain = max(2.0 * (float(likelihood[i, best]) - before), 0.0)
             values, uncertainty, at = term.values.copy(), np.zeros(len(term.values)), slice(linear.shape[1])
@@ -203,8 +208,7 @@ class Ranking:
             plausible = within(values, uncertainty, limits.get(this.name, np.inf))
             p, admissible = float(scipy.special.chdtrc(k, gain)), bool(weakest[i] > MIN_NEW_VARIANCE)
             delta_bic = gain - k * of_one
-            drop = float(2.0 * signal @ cross[i, 0] - signal @ inner[i, 0] @ signal)
-            score = Score(this.name, delta_bic, p, k, values, uncertainty, best, admissible, plausible, drop)
+            score = Score(this.name, delta_bic, p, k, values, uncertainty, best, admissible, plausible, drops[i])
             yield j, score, likelihood[i]
 
     def shares(self, j: int, selected: Sequence[int], setting: int) -> dict[str, float]:
@@ -238,14 +242,9 @@ class Ranking:
 
     def explained(self) -> Values:
         """Return the decrease of the base's whitened sum of squares by each candidate, white noise: (c,) array."""
-        products, found = self.products[0], np.zeros(len(self.places))
-        definite = products + UNIT_COLUMN_RIDGE * np.eye(len(products))
-        for members in by_size([len(at) for at in self.places]):
-            at = np.stack([self.places[j] for j in members])
-            cross = products[at, -1]
-            solved = np.linalg.solve(definite[at[:, :, None], at[:, None]], cross[..., None])[..., 0]
-            found[members] = np.sum(cross * solved, axis=1)
-        return found
+        if not self._explained:
+            self.scores([], {})
+        return np.array([self._explained.get(j, 0.0) for j in range(len(self.places))])
 
     def visibility(self, j: int, limits: Values) -> Values:
         """Return the expected gain in 2 log L of an effect whose parameters are all at their limits: (t,) array."""
@@ -273,7 +272,8 @@ def without(products: Values, index: Index) -> Values:
     rest = products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
     new = np.einsum("tpp->tp", rest) > MIN_LEFT_SQUARE_SHARE * np.einsum("tpp->tp", products)
     new[:, -1] = True
-    rest *= new[:, :, None] & new[:, None, :]
+    setting, column = np.nonzero(~new)
+    rest[setting, column] = rest[setting, :, column] = 0.0
     return np.asarray(rest)
 
 

@@ -95,6 +95,7 @@ class TableTilt(DeclaredEffect):
     """Tilt of the table: two coefficients."""
 
     layout = Layout.SHARED
+    of_samples = True
     needs = ("level",)
     unseen = MappingProxyType({"gyroscope": "the direction of gravity does not change a rate"})
 
@@ -218,6 +219,7 @@ class WarmUp(DeclaredEffect):
     """Exponential settling of the bias: one amplitude an axis and one time constant."""
 
     layout = Layout.EVERY_AXIS
+    of_samples = True
     needs_clock = True
     nonlinear = ("time_constant",)
 
