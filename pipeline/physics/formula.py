@@ -15,6 +15,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import accumulate
 from typing import Any, NamedTuple
 
@@ -127,6 +128,7 @@ class Formula:
         return self._c.format(axis=axis)
 
 
+@lru_cache(maxsize=256)
 def parse(text: str) -> Formula:
     """Parse a formula.
 

@@ -22,7 +22,7 @@ from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe, without_rows
 from pipeline.estimation.selection import Selection, select
 from pipeline.evaluation.diagnosis import turntable
-from pipeline.evaluation.diagnosis.form_scan import ProjectedCurves, Scan
+from pipeline.evaluation.diagnosis.form_scan import ProjectedCurves, Scan, WhiteAxis
 from pipeline.evaluation.diagnosis.formula_discovery import (
     Discovery,
     FormProducts,
@@ -276,6 +276,36 @@ def test_products_of_factors_and_modulators_gain_what_the_columns_of_the_forms_g
             assert [each.axes for each in found] == [each.axes for each in expected]
             for one, other in zip(found, expected, strict=True):
                 assert one.delta_bic == pytest.approx(other.delta_bic, rel=1e-6, abs=1e-6)
+
+
+def test_what_columns_explain_under_white_noise_is_what_least_squares_say() -> None:
+    rng = np.random.default_rng(3)
+    model, F, G, sets = (rng.standard_normal((40, *shape)) for shape in ((3,), (4,), (2,), (2, 5)))
+    reading, sets = rng.standard_normal(40), sets.swapaxes(0, 1)
+
+    def left(*columns: np.ndarray) -> float:
+        return float(np.linalg.lstsq(np.column_stack([model, *columns]), reading, rcond=None)[1][0])
+
+    axis = WhiteAxis(reading, model[:, :0])
+    axis.add(model)
+    assert axis.residual @ axis.residual == pytest.approx(left())
+    found, expected = axis.explained(F, G), [[left() - left(f * g) for g in G.T] for f in F.T]
+    assert found == pytest.approx(np.array(expected))
+    assert axis.explained_together(sets) == pytest.approx(np.array([left() - left(each) for each in sets]))
+    assert axis.add(F) == pytest.approx(left() - left(F))
+
+
+@pytest.mark.parametrize(("cycles", "searched"), [(5, True), (40, False)])
+def test_no_formula_is_searched_where_none_may_reach_the_noise(cycles: int, *, searched: bool) -> None:
+    def ripple(recording: Recording) -> np.ndarray:
+        angle = np.zeros(recording.samples) if recording.table_angle is None else recording.table_angle
+        return 0.02 * np.cos(np.radians(cycles * angle))[:, None] * np.ones(3)
+
+    selection = selection_of("accelerometer", with_extra("accelerometer", ripple))
+    noise = selection.noise
+    assert noise is not None
+    assert selection.fit.residual_rms > 2.0 * noise.white.max()
+    assert Forms(selection).may_leave(4.0 * float(np.mean(noise.white**2))) == searched
 
 
 def test_products_of_resamples_are_those_of_their_rows() -> None:

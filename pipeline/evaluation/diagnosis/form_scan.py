@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
+from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
@@ -75,7 +76,7 @@ class Scan:
         self.scale = selection.start.scale
         self.observations = observations = selection.observations.less_stop_errors
         motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]
-        self._motions = [motion for motion, _ in joined_motions(motions)]
+        self.motions = [motion for motion, _ in joined_motions(motions)]
         self.blocks, self.weight = observations.blocks, observations.weight
         self._label = self.blocks.label(len(self.weight))
         self.settings = WHITE_SETTING, *selection.settings
@@ -92,6 +93,14 @@ class Scan:
             self._places = [np.append(*each) for each in zip(more, self._places, strict=True)]
         self.columns, self.every = A, self.whitened(A)  # model, explained curves and readings of all axes
         self._fit(self.every.times(self.every))
+
+    def white(self, c: int, rows: Mask) -> WhiteAxis:
+        """Return what the model leaves of an axis at some rows, weighted."""
+        *known, target = self._places[c]
+        columns = np.sqrt(self.weight[rows])[:, None] * self.columns[rows]
+        found = WhiteAxis(columns[:, target], columns[:, :0])
+        found.add(columns[:, known])
+        return found
 
     def _fit(self, among: Values) -> None:
         """Compute what the model leaves of the readings from the products of all columns, (t, p, p)."""
@@ -157,7 +166,7 @@ class Scan:
 
         They depend at a sample on the motion there alone.
         """
-        return np.concatenate([curves(motion) for motion in self._motions])
+        return np.concatenate([curves(motion) for motion in self.motions])
 
     def whitened(self, columns: Values) -> Whitened:
         """Return (n, q) columns whitened."""
@@ -257,6 +266,36 @@ class Scan:
             found.append((inner / scale**2, cross.reshape(own.shape) / scale**2, error / scale))
         inner, cross, error = (np.stack(each, axis=1) for each in zip(*found, strict=True))
         return inner, cross, error
+
+
+@dataclass
+class WhiteAxis:
+    """What orthonormal columns of a model, (n, k), leave of the readings of an axis, (n,), under white noise."""
+
+    residual: Values
+    model: Values
+
+    def _without_model(self, columns: Values) -> Values:
+        """Return orthonormal columns that span (..., n, r) columns without their part in the model."""
+        return np.asarray(np.linalg.qr(columns - self.model @ (self.model.T @ columns))[0])
+
+    def add(self, columns: Values) -> float:
+        """Add columns to the model, and return what they explain."""
+        new = self._without_model(columns)
+        parts = new.T @ self.residual
+        self.model, self.residual = np.hstack([self.model, new]), self.residual - new @ parts
+        return float(parts @ parts)
+
+    def explained(self, F: Values, G: Values) -> Values:
+        """Return what each product of one of q and one of p columns explains: (q, p) array."""
+        own, taken = (F**2).T @ G**2, F.T @ (G[:, :, None] * self.model[:, None]).reshape(len(F), -1)
+        rest = own - np.sum(taken.reshape(*own.shape, -1) ** 2, axis=2)
+        new = rest > MIN_NEW_COLUMN_SHARE**2 * own
+        return np.where(new, (F.T @ (G * self.residual[:, None])) ** 2 / np.where(new, rest, 1.0), 0.0)
+
+    def explained_together(self, sets: Values) -> Values:
+        """Return what each of m sets of r columns explains, (m, n, r): (m,) array."""
+        return np.asarray(np.sum((self.residual @ self._without_model(sets)) ** 2, axis=1))
 
 
 class ProjectedCurves:

@@ -56,6 +56,7 @@ REFINED = 16  # forms that are scored under every noise setting, and whose const
 SCAN_REFINEMENTS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
 ROWS_AT_ONCE = 1024  # whose products of columns are computed together: 16 MB for 100 columns of a model
 SAME_CRITERION = 1e-6  # a thousand times the rounding of fits of one model
+SCREENED_ROWS = 500  # about; enough for ten of each parameter, and fewer would only let more formulas pass
 PROBED = 200  # rows; two forms whose values there are equal to 1e-9 are one
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
 OBSERVABLE_BY = {"temperature": "bias_temperature"}  # effect that is observable if the recordings vary the covariate
@@ -126,7 +127,7 @@ class FormProducts:
             )
             for (r, axes), members in alike.items()
         ]
-        F, G = self.columns = [np.stack(known, axis=1) for known in kinds]
+        F, G = self.columns = [np.stack(known).T for known in kinds]
         weighted, edges = scan.weight[:, None] * G, [*scan.blocks.first.tolist(), len(F)]
         sums = np.stack([F[at].T @ weighted[at] for at in starmap(slice, pairwise(edges))])
         self.means = sums.reshape(len(sums), -1) / scan.blocks.weight[:, None]
@@ -205,7 +206,7 @@ class Forms:
         self.explained = forms.columns_of(formulas, self.sensor) if formulas else None
         self.scan = Scan(self.selection, self.explained)
 
-    def on_axis(self, text: str, factor: Factor, axis: int) -> Values:
+    def on_axis(self, text: str, factor: Factor | None, axis: int) -> Values:
         """Return the values of a factor's formula on an axis: (n,) array."""
         column = self.column(text, factor)
         return column[:, axis % column.shape[1]]
@@ -218,7 +219,7 @@ class Forms:
         if text not in self._columns:
             of_signal = factor.values(self.column(factor.signal)) if factor and factor.constants else None
             if of_signal is None:
-                of_signal = self.scan.values(forms.columns_of([text], self.sensor))[:, :, 0]
+                of_signal = np.concatenate([forms.values_of(parse(text), signals) for signals in self._signals])
             self._columns[text] = of_signal
         return self._columns[text]
 
@@ -250,6 +251,46 @@ class Forms:
         self._columns = of_coarse  # those of the finer constants would have as much memory again
         return _best_of_each([*best, *self._polynomials()])
 
+    def may_leave(self, mean_square: float) -> bool:
+        """Return whether a formula may leave so small a mean square of the residual.
+
+        It may not if terms that explain no more together than apart leave more: in addition to given terms, all that
+        ``MAX_FORMULA_TERMS`` explain is at most so many times what the best one does. White noise is assumed, under
+        which a fit leaves least. A term is a factor with any modulator, a band, or a polynomial.
+        """
+        thin, (factors, modulators), every = copy(self), self._factors, -(-len(self.scan.weight) // SCREENED_ROWS)
+        vars(thin).update(_columns={}, _signals=[{k: v[::every] for k, v in each.items()} for each in self._signals])
+        rows = np.concatenate([np.arange(len(each["u"])) % every == 0 for each in self._signals])
+        root, first = np.sqrt(self.scan.weight[rows])[:, None], np.cumsum([0, *(len(f.texts) for f in factors[:-1])])
+        above = thin.column("speed") >= (self._spans["speed"].places() if "speed" in self._spans else np.zeros(1))
+        low, high = np.triu_indices(above.shape[1])
+        bands, ones, axes = root * (above[:, low] & ~above[:, high]), np.ones_like(root), []
+        for c in range(3):
+            F = np.stack([thin.on_axis(text, factor, c) for factor in factors for text in factor.texts]).T
+            G = np.stack([thin.on_axis(m.texts[0], m, c) if m else ones[:, 0] for m in modulators]).T
+            powers = F[:, : len(forms.POWERS) * (len(self._spans) + 1)].reshape(len(F), -1, len(forms.POWERS))
+            axes.append((self.scan.white(c, rows), F, root * G, root * powers.swapaxes(0, 1)))
+        excess = sum(axis.residual @ axis.residual for axis, *_ in axes) - mean_square * 3.0 * np.sum(root**2)
+        for _ in range(MAX_FORMULA_TERMS):
+            products = np.add.reduceat(np.sum([axis.explained(F, G) for axis, F, G, _ in axes], axis=0), first)
+            of_bands = np.sum([axis.explained(bands, ones) for axis, *_ in axes], axis=0)
+            polynomials = np.sum([axis.explained_together(powers) for axis, *_, powers in axes], axis=0)
+            if excess > MAX_FORMULA_TERMS * max(products.max(), of_bands.max(), polynomials.max()):
+                return False
+            f, m = np.unravel_index(products.argmax(), products.shape)
+            columns = slice(first[f], first[f] + len(factors[f].texts))
+            excess -= sum(axis.add(F[:, columns] * G[:, m, None]) for axis, F, G, _ in axes)
+        return True
+
+    @cached_property
+    def _factors(self) -> tuple[list[Factor], list[Factor | None]]:
+        turning = any(part.motion.axis is not None for part in self.selection.observations.parts)
+        return forms.factors(self._spans, turning=turning), forms.modulators(self._spans)
+
+    @cached_property
+    def _signals(self) -> list[dict[str, Values]]:
+        return [forms.signals_of(motion, self.sensor) for motion in self.scan.motions]
+
     @cached_property
     def _spans(self) -> dict[str, Span]:
         observations = self.selection.observations
@@ -260,8 +301,7 @@ class Forms:
     def _tried(self) -> list[Form]:
         """Return the forms of the coarse scan without those of the catalogue; of equal forms the simplest."""
         spans = self._spans
-        turning = any(part.motion.axis is not None for part in self.selection.observations.parts)
-        factors, modulators = forms.factors(spans, turning=turning), forms.modulators(spans)
+        factors, modulators = self._factors
         able = ((f, m) for m in modulators for f in factors if m is None or f.signal != m.signal or f.kind == "step")
         pairs = [Form(factor, modulator) for factor, modulator in able]
         rows = np.random.default_rng(0).integers(len(self.selection.observations.weight), size=PROBED)
@@ -375,7 +415,7 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
     """Search for a formula in addition to base, configured and selected effects.
 
     ``unknown``: the ``dependences`` of the selection. No form is suggested if the residual with it is far above the
-    noise: then something else is missing.
+    noise: then something else is missing. None is searched where that is certain before (``Forms.may_leave``).
     """
     noise = case.noise
     floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
@@ -384,6 +424,9 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
     tried: list[tuple[Sequence[str], Sequence[str]]] = []
     for context in [selection, alone] if selection.names else [selection]:
         grammar = grammar.at(context) if grammar else Forms(context)
+        far = 0.0 < FAR_ABOVE * floor < context.fit.residual_rms
+        if far and not grammar.may_leave((FAR_ABOVE * floor) ** 2):
+            continue
         terms, ranked = search(grammar)
         if not terms:
             continue
@@ -394,10 +437,9 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
         definition = suggested_effect(entry.covariate, found, case.sensor, catalogue())
         form = effect_from(definition, "a first guess")
         added = [*context.fit.terms, EffectColumns(form, np.zeros(len(form.parameters(case.sensor))))]
-        if 0.0 < FAR_ABOVE * floor < context.fit.residual_rms:
-            fit = fit_terms(context.observations, added, context.start, context.settings)
-            if fit.residual_rms > FAR_ABOVE * floor:
-                continue
+        start = context.observations, added, context.start, context.settings
+        if far and fit_terms(*start).residual_rms > FAR_ABOVE * floor:
+            continue
         tried.append((found.formulas, found.axes))
         names = [*case.configured, form.name]
         register(form)

@@ -12,7 +12,7 @@ scanned constants a, w, c count as parameters of the fit.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -24,7 +24,7 @@ from pipeline.core.records import Motion, Values
 from pipeline.estimation.observations import Observations
 from pipeline.physics.effects.base import truth, unit_of
 from pipeline.physics.effects.equations import CURVE_DEGREE
-from pipeline.physics.formula import parse
+from pipeline.physics.formula import Formula, parse
 
 CYCLES = range(1, 13)
 POWERS = range(1, 6)
@@ -55,26 +55,26 @@ def columns_of(formulas: Iterable[str], sensor: str) -> Curves:
     parsed = [parse(text) for text in formulas]
 
     def columns(motion: Motion) -> Values:
-        n, u = len(motion.time), truth(sensor, motion)
-        signals = {name: value for name, value in signals_of(motion).items() if value is not None}
-        of_axes = []
-        for c in range(3 if any("u" in formula.signals for formula in parsed) else 1):
-            known = signals | {"u": u[:, c]}
-            values = [np.broadcast_to(f(known), (n,)) if f.signals <= known.keys() else np.zeros(n) for f in parsed]
-            of_axes.append(np.stack(values, axis=1))
-        return np.stack(of_axes, axis=1)
+        signals = signals_of(motion, sensor)
+        return np.stack(np.broadcast_arrays(*(values_of(formula, signals) for formula in parsed)), axis=2)
 
     return columns
 
 
-def signals_of(motion: Motion) -> dict[str, Values | None]:
-    """Return the signals of the formula language in a motion, without ``u``."""
-    found: dict[str, Values | None] = {"time": motion.time, "temperature": motion.temperature, "angle": motion.angle}
+def values_of(formula: Formula, signals: Mapping[str, Values]) -> Values:
+    """Return the values of a formula, zero without one of its signals: (n, 1) array, or (n, 3) with ``u``."""
+    shape = len(signals["u"]), 3 if "u" in formula.signals else 1
+    return np.broadcast_to(formula(signals) if formula.signals <= signals.keys() else np.zeros(()), shape)
+
+
+def signals_of(motion: Motion, sensor: str) -> dict[str, Values]:
+    """Return the signals of the formula language that a motion holds: (n, 1) arrays, ``u`` (n, 3)."""
     speed = np.sqrt(np.einsum("ij,ij->i", motion.angular_rate, motion.angular_rate))
-    found |= {"rate": motion.rate, "speed": speed}
+    of_one = {"time": motion.time, "temperature": motion.temperature, "angle": motion.angle, "rate": motion.rate}
+    found = {name: value[:, None] for name, value in {**of_one, "speed": speed}.items() if value is not None}
     for c, axis in enumerate("xyz"):
-        found[f"f{axis}"], found[f"w{axis}"] = motion.specific_force[:, c], motion.angular_rate[:, c]
-    return found
+        found[f"f{axis}"], found[f"w{axis}"] = motion.specific_force[:, c, None], motion.angular_rate[:, c, None]
+    return found | {"u": truth(sensor, motion)}
 
 
 def available_signals(observations: Observations) -> list[str]:
@@ -95,8 +95,8 @@ class Span:
     @classmethod
     def of(cls, observations: Observations, signal: str) -> Span:
         """Return the span of a signal."""
-        found = [v for part in observations.parts if (v := signals_of(part.motion)[signal]) is not None]
-        return cls(signal, np.sort(np.concatenate(found)))
+        known = (signals_of(part.motion, observations.sensor) for part in observations.parts)
+        return cls(signal, np.sort(np.concatenate([each[signal][:, 0] for each in known if signal in each])))
 
     @property
     def low(self) -> float:
@@ -142,7 +142,10 @@ class Factor:
     origin: float = 0.0  # of the signal in an exponential
 
     def values(self, signal: Values) -> Values | None:
-        """Return the values of a step or an exponential without parsing its formula; None for other factors."""
+        """Return the values of a factor with constants without parsing its formula; None for other factors."""
+        if self.kind == "band":
+            low, high = (float(f"{place:.5g}") for place in self.constants)
+            return np.logical_and(signal >= low, signal <= high).astype(float)
         if self.kind == "step":
             above, widths = signal - float(f"{self.constants[0]:.7g}"), self.constants[1:]
             return 0.5 * (1.0 + np.tanh(above / float(f"{widths[0]:.3g}"))) if widths else np.heaviside(above, 1.0)

@@ -52,12 +52,13 @@ from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import WHITE_SETTING, Blocks, Products, Setting, selection_grid
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.multi_position.fit import solve
+from pipeline.estimation.observations import Observations
 from pipeline.estimation.ranking import projection
 from pipeline.estimation.selection import Selection
 from pipeline.evaluation.diagnosis.form_scan import ProjectedCurves, Scan, Whitened, each_explains
 from pipeline.evaluation.diagnosis.functional_forms import Curves, Span, available_signals, columns_of, signals_of
 from pipeline.physics.effects import effect
-from pipeline.physics.effects.base import Layout, truth, unit_of
+from pipeline.physics.effects.base import Layout, unit_of
 from pipeline.physics.effects.equations import CURVE_DEGREE, MAX_CURVE_CYCLES
 from pipeline.physics.formula import parse
 
@@ -158,9 +159,9 @@ def _tests_of_steps(selection: Selection, covariates: Sequence[str], scan: Scan)
     ripples = MAX_CURVE_CYCLES - LEAST_RIPPLE + 1 if rippled else 0
 
     def curves(motion: Motion) -> Values:
-        signals, columns = signals_of(motion), []
+        signals, columns = signals_of(motion, observations.sensor), []
         for signal, places in scanned:
-            above = np.asarray(signals[signal])[:, None] - places
+            above = signals[signal] - places
             columns += [(above >= 0).astype(float), np.tanh(above / (np.ptp(places) / STEP_POSITIONS + 1e-12))]
         if ripples:
             rate = np.zeros(len(motion.time)) if motion.rate is None else motion.rate
@@ -249,7 +250,7 @@ def _bases_of(selection: Selection) -> list[Basis]:
     available = available_signals(observations)
     for covariate, signal in SIGNAL_OF_COVARIATE.items():
         if signal in available:
-            bases.append((covariate, _chebyshev(Span.of(observations, signal)), [(range(CURVE_DEGREE), 2)]))
+            bases.append((covariate, _chebyshev(observations, signal), [(range(CURVE_DEGREE), 2)]))
     if any(part.motion.axis is not None for part in observations.parts):
         count = MAX_CURVE_CYCLES - MIN_CYCLES + 1
         single: list[Block] = [((j, count + j), 2) for j in range(count)]
@@ -257,11 +258,12 @@ def _bases_of(selection: Selection) -> list[Basis]:
     return bases
 
 
-def _chebyshev(span: Span) -> Callable[[Motion], Values]:
+def _chebyshev(observations: Observations, signal: str) -> Callable[[Motion], Values]:
     """Return the function from motion to Chebyshev polynomials of degree 1 to 5 of a signal over its span."""
+    span = Span.of(observations, signal)
 
     def curves(motion: Motion) -> Values:
-        x = 2.0 * (np.asarray(signals_of(motion)[span.signal]) - span.low) / span.size - 1.0
+        x = 2.0 * (signals_of(motion, observations.sensor)[signal][:, 0] - span.low) / span.size - 1.0
         return np.asarray(chebvander(x, CURVE_DEGREE)[:, 1:], np.float64)
 
     return curves
@@ -420,12 +422,9 @@ def _signal_forms(selection: Selection, entry: Dependence) -> tuple[str, list[tu
 
 def _values(selection: Selection, signal: str) -> Values:
     """Return a signal in all rows for each axis, NaN in recordings without it: (n, 3) array."""
-    sensor, found = selection.observations.sensor, []
-    for part in selection.observations.parts:
-        value = truth(sensor, part.motion) if signal == "u" else signals_of(part.motion)[signal]
-        value = np.full(len(part.weight), np.nan) if value is None else value
-        found.append(value if value.ndim == 2 else np.repeat(value[:, None], 3, axis=1))
-    values = np.concatenate(found)
+    known = (signals_of(part.motion, selection.observations.sensor) for part in selection.observations.parts)
+    of_parts = [np.broadcast_to(each.get(signal, np.nan), each["u"].shape) for each in known]
+    values = np.concatenate(of_parts)
     return np.mod(values, 360.0) if signal == "angle" else values
 
 
