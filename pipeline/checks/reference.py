@@ -106,7 +106,6 @@ class ChannelComparison:
         self.dt = recording.time_steps
         self.interval = recording.interval
         self._summed: dict[tuple[str, int], tuple[Values, Values, Values, Values]] = {}  # by channel and size
-        self._each: dict[str, tuple[Values, Values, Values]] = {}  # by channel
         self.known = np.ones(len(self.dt), bool)  # intervals in which every channel is known
         for channel in channels:
             finite = np.isfinite(channel.low)
@@ -217,20 +216,15 @@ class ChannelComparison:
         """Return for each stretch: angle, sum of its magnitudes, squared error by bends, and range of the rate."""
         if (channel.name, size) in self._summed:
             return self._summed[channel.name, size]
-        turned, rate, bend = self._each[channel.name] = self._each.get(channel.name) or self._of_intervals(channel)
-        swing = np.maximum.reduceat(rate, starts) - np.minimum.reduceat(rate, starts)
-        angle, total, bends = (np.add.reduceat(v, starts) for v in (turned, np.abs(turned), bend))
-        self._summed[channel.name, size] = angle, total, bends, swing
-        return angle, total, bends, swing
-
-    def _of_intervals(self, channel: Channel) -> tuple[Values, Values, Values]:
-        """Return angle, rate and squared error by bends in each interval; 0 where a channel is unknown."""
         turned, bend = np.where(self.known, channel.turned, 0.0), np.zeros(len(self.dt))
         rate = np.where(self.known, channel.low if channel.of_intervals else channel.low[1:], 0.0)
         if not channel.of_intervals:
             steps = np.diff(np.where(np.isfinite(channel.low), channel.low, 0.0))
             bend = (np.where(self.known, 0.5 * steps, 0.0) * self.dt) ** 2
-        return turned, rate, bend
+        swing = np.maximum.reduceat(rate, starts) - np.minimum.reduceat(rate, starts)
+        angle, total, bends = (np.add.reduceat(v, starts) for v in (turned, np.abs(turned), bend))
+        self._summed[channel.name, size] = angle, total, bends, swing
+        return angle, total, bends, swing
 
 
 def _near(other: Channel, claim: Channel, reach: int) -> tuple[Values, Values, Values]:

@@ -341,10 +341,8 @@ def _check_force(table: Log) -> None:
         return
     stride = -(-len(table.time_ns) // MEDIAN_SAMPLES)
     squares = np.asarray(sum(table.values[c][::stride] ** 2 for c in TRIADS["accelerometer"]))
-    low, high = FORCE_RANGE_G
-    if low**2 <= squares.min() and squares.max() <= high**2:
-        return
     usual = float(np.sqrt(median(squares)))
+    low, high = FORCE_RANGE_G
     if low <= usual <= high:
         return
     hint = "is the unit or the scale right?"

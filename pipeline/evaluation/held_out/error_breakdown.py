@@ -47,7 +47,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
@@ -310,12 +310,6 @@ class LinearizedSamples:
     number: int  # known samples of the recording
     correlated_samples: float = 1.0  # as in ``Samples``
 
-    def thinned(self) -> LinearizedSamples:
-        """Return every second, third .. sample, ``FORM_SAMPLES`` or fewer."""
-        step = -(-len(self.time) // FORM_SAMPLES)
-        thin: dict[str, Any] = {name: each[::step] for name, each in vars(self).items() if isinstance(each, np.ndarray)}
-        return self if step == 1 else replace(self, **thin)
-
 
 def linearized(calibration: SensorCalibration, samples: Samples) -> LinearizedSamples | None:
     """Return representative held-out samples with their derivative; None where an effect is left out of them.
@@ -475,7 +469,9 @@ def _form(
     white, within, size = np.zeros(2), np.zeros(2), q
     of_parameters, of_blocks = np.zeros((q, q)), []
     for every in held_out:
-        each, whole = every.thinned(), len(every.time)
+        whole = len(every.time)
+        thin = {name: v[:: -(-whole // FORM_SAMPLES)] for name, v in vars(every).items() if isinstance(v, np.ndarray)}
+        each: LinearizedSamples = replace(every, **cast("dict[str, Any]", thin))
         n, share = len(each.truth), each.number / total
         count = max(1, min(n, round(HELD_OUT_BLOCKS * share)))
         label = np.arange(n) * count // n
