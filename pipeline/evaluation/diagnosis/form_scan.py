@@ -124,13 +124,13 @@ class Scan:
         self.left: Values = np.stack(left, axis=1)
         self.before = float(self.log_likelihood(self.left.sum(axis=1)).max())
 
-    def of_settings(self, few: Iterable[Setting]) -> Scan:
-        """Return the scan under some of its noise settings."""
-        found, at = copy(self), [0, *(1 + self.settings[1:].index(setting) for setting in few)]
-        found.settings = tuple(self.settings[k] for k in at)
+    def under(self, settings: Iterable[Setting]) -> Scan:
+        """Return the scan under other noise settings."""
+        found = copy(self)
+        found.settings = WHITE_SETTING, *settings
         found.noise = self.blocks.model(found.settings)
-        found.every = Whitened(self.every.inside, self.every.means[at])
-        found._fit(self._among[at])  # noqa: SLF001
+        found.every = Whitened(self.every.inside, found.noise.whitened(self.means(self.columns)))
+        found._fit(found.every.times(found.every))  # noqa: SLF001
         return found
 
     def resampled(

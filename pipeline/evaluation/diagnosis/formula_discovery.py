@@ -56,6 +56,7 @@ REFINED = 16  # forms that are scored under every noise setting, and whose const
 SCAN_REFINEMENTS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
 ROWS_AT_ONCE = 1024  # whose products of columns are computed together: 16 MB for 100 columns of a model
 SAME_CRITERION = 1e-6  # a thousand times the rounding of fits of one model
+BETWEEN_PLACES = 0.2  # share by which a term may explain more between the places of the coarse scan, at 1/4 of the span
 SCREENED_ROWS = 500  # about; enough for ten of each parameter, and fewer would only let more formulas pass
 PROBED = 200  # rows; two forms whose values there are equal to 1e-9 are one
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
@@ -234,8 +235,7 @@ class Forms:
             products = FormProducts(self, self._tried[: len(self._tried) - len(bands)], self.scan, apart=True)
             self._kept = [products, *([FormProducts(self, bands, self.scan, apart=False)] if bands else [])]
         ordered = sorted(self.selection.settings, key=lambda setting: setting.ratio)
-        few = dict.fromkeys([self.selection.fit.setting, ordered[0], ordered[len(ordered) // 2]])
-        scan = self.scan.of_settings(few)
+        scan = self.scan.under(dict.fromkeys([self.selection.fit.setting, ordered[0], ordered[len(ordered) // 2]]))
         gains = [gain for table in self._kept for gain in table.gains(scan)]
         return [each.form for each in _best_of_each(map(ScoredForm, self._tried, gains))[:REFINED]]
 
@@ -255,8 +255,8 @@ class Forms:
         """Return whether a formula may leave so small a mean square of the residual.
 
         It may not if terms that explain no more together than apart leave more: in addition to given terms, all that
-        ``MAX_FORMULA_TERMS`` explain is at most so many times what the best one does. White noise is assumed, under
-        which a fit leaves least. A term is a factor with any modulator, a band, or a polynomial.
+        ``MAX_FORMULA_TERMS`` explain is at most so many times what the best one does, and what the given ones explain
+        with finer constants. White noise leaves least. A term is a factor with any modulator, a band, or a polynomial.
         """
         thin, (factors, modulators), every = copy(self), self._factors, -(-len(self.scan.weight) // SCREENED_ROWS)
         vars(thin).update(_columns={}, _signals=[{k: v[::every] for k, v in each.items()} for each in self._signals])
@@ -264,7 +264,7 @@ class Forms:
         root, first = np.sqrt(self.scan.weight[rows])[:, None], np.cumsum([0, *(len(f.texts) for f in factors[:-1])])
         above = thin.column("speed") >= (self._spans["speed"].places() if "speed" in self._spans else np.zeros(1))
         low, high = np.triu_indices(above.shape[1])
-        bands, ones, axes = root * (above[:, low] & ~above[:, high]), np.ones_like(root), []
+        bands, ones, axes, explained = root * (above[:, low] & ~above[:, high]), np.ones_like(root), [], 0.0
         for c in range(3):
             F = np.stack([thin.on_axis(text, factor, c) for factor in factors for text in factor.texts]).T
             G = np.stack([thin.on_axis(m.texts[0], m, c) if m else ones[:, 0] for m in modulators]).T
@@ -275,11 +275,12 @@ class Forms:
             products = np.add.reduceat(np.sum([axis.explained(F, G) for axis, F, G, _ in axes], axis=0), first)
             of_bands = np.sum([axis.explained(bands, ones) for axis, *_ in axes], axis=0)
             polynomials = np.sum([axis.explained_together(powers) for axis, *_, powers in axes], axis=0)
-            if excess > MAX_FORMULA_TERMS * max(products.max(), of_bands.max(), polynomials.max()):
+            most = max(products.max(), of_bands.max(), polynomials.max())
+            if excess - explained > MAX_FORMULA_TERMS * most + BETWEEN_PLACES * explained:
                 return False
             f, m = np.unravel_index(products.argmax(), products.shape)
             columns = slice(first[f], first[f] + len(factors[f].texts))
-            excess -= sum(axis.add(F[:, columns] * G[:, m, None]) for axis, F, G, _ in axes)
+            explained += sum(axis.add(F[:, columns] * G[:, m, None]) for axis, F, G, _ in axes)
         return True
 
     @cached_property
@@ -294,8 +295,7 @@ class Forms:
     @cached_property
     def _spans(self) -> dict[str, Span]:
         observations = self.selection.observations
-        names = ["fx", "fy", "fz", *forms.available_signals(observations)]
-        return {name: Span.of(observations, name) for name in names}
+        return {s: Span.of(observations, s) for s in ("fx", "fy", "fz", *forms.available_signals(observations))}
 
     @cached_property
     def _tried(self) -> list[Form]:
