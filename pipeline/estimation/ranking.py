@@ -133,7 +133,11 @@ class Ranking:
 
     def chosen(self, selected: Sequence[int]) -> Values:
         """Return the products with base and selected candidates projected out: (t, q + 1, q + 1) array."""
-        return without(self.products, np.concatenate([np.zeros(0, int), *[self.places[j] for j in selected]]))
+        return without(self.products, self._at(selected))
+
+    def _at(self, selected: Sequence[int]) -> Index:
+        """Return the places of selected candidates in ``products``."""
+        return np.concatenate([np.zeros(0, int), *[self.places[j] for j in selected]])
 
     def log_likelihood(self, rss: Values) -> Values:
         """Return log L at each noise setting."""
@@ -144,9 +148,17 @@ class Ranking:
         """Return log L of base and selected candidates at each noise setting, the first white noise alone."""
         if (known := self._with.get(tuple(selected))) is not None:
             return known
-        place = np.concatenate([*[self.places[j] for j in selected], [-1]]).astype(int)
-        rest = without(self.products[:, place[:, None], place], np.arange(len(place) - 1))
-        return self.log_likelihood(rest[:, -1, -1])
+        return self.log_likelihood(self.left([selected])[0])
+
+    def left(self, sets: Sequence[Sequence[int]], settings: slice = slice(None)) -> Values:
+        """Return what base and each set of candidates leave of the whitened sum of squares at some noise settings.
+
+        ``sets``: m sets with equal numbers of directions. Returns a (m, t) array.
+        """
+        place = np.array([[*self._at(selected), -1] for selected in sets])
+        products = self.products[settings][:, place[:, :, None], place[:, None]].swapaxes(0, 1)
+        rest = without(products.reshape(-1, *products.shape[2:]), np.arange(place.shape[1] - 1))
+        return rest[:, -1, -1].reshape(len(sets), -1)
 
     def of_model(self, selected: Sequence[int]) -> tuple[float, int]:
         """Return the largest log likelihood of base and selected candidates, and the index of its noise setting."""

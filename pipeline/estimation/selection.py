@@ -36,7 +36,7 @@ from pipeline.estimation.generalized_least_squares import (
     require_observable,
 )
 from pipeline.estimation.observations import Observations, weighted
-from pipeline.estimation.ranking import Ranking, Score
+from pipeline.estimation.ranking import Ranking, Score, by_size
 from pipeline.physics.effects import effect
 
 MAX_SELECTED_EFFECTS = 5  # effects that one selection adds
@@ -173,6 +173,8 @@ class Selection:
 
     def with_more(self, names: Sequence[str]) -> Selection:
         """Return the selection with further effects; itself if one of them is not possible or lowers the BIC."""
+        if not self.candidates.keys() >= {*names}:
+            return self
         found = replace(self, steps=dict(self.steps), fits=dict(self.fits), refused=set(self.refused))
         for name in names:
             score = found._given(found.names).get(name)  # noqa: SLF001  (of this class)
@@ -309,7 +311,7 @@ class Selection:
             return True
         selected = [*self.ranking.of_effects(self.names), *partners]
         floor = np.sum((self.noise.white**2 + self.noise.wander**2) / self.start.scale**2) / 3.0
-        residual = (self.ranking.chosen(selected)[0, -1, -1] + self.ranking.within) / self.ranking.samples
+        residual = (float(self.ranking.left([selected], slice(1))[0, 0]) + self.ranking.within) / self.ranking.samples
         drop = score.drop / self.ranking.samples
         return bool(residual - drop < FAR_ABOVE**2 * floor or drop > WORTH_NAMING * (residual - floor))
 
@@ -441,12 +443,15 @@ class Selection:
         ranking = self.ranking
         before, _ = ranking.of_model([])
         able = [j for j, place in enumerate(ranking.places) if len(place)]
+        names = [candidate.effect.name for candidate in ranking.candidates]
+        pairs = [(j, k) for j, k in combinations(able, 2) if names[j] != names[k]]
         best: tuple[float, int, int] = (2.0 * MIN_DELTA_BIC, -1, -1)
-        for j, k in combinations(able, 2):
-            if ranking.candidates[j].effect.name != ranking.candidates[k].effect.name:
-                gain = 2.0 * (ranking.of_model([j, k])[0] - before)
-                count = len(ranking.places[j]) + len(ranking.places[k])
-                best = max(best, (gain - count * float(np.log(ranking.samples)), j, k))
+        for members in by_size(len(ranking.places[j]) + len(ranking.places[k]) for j, k in pairs):
+            alike = [pairs[m] for m in members]
+            price = sum(len(ranking.places[j]) for j in alike[0]) * float(np.log(ranking.samples))
+            likelihoods = ranking.log_likelihood(ranking.left(alike))[:, 1:].max(axis=1)
+            gains = 2.0 * (likelihoods - before) - price
+            best = max(best, *((gain, *pair) for gain, pair in zip(gains.tolist(), alike, strict=True)))
         _, j, k = best
         if j < 0:
             return
