@@ -128,7 +128,7 @@ class FormProducts:
             )
             for (r, axes), members in alike.items()
         ]
-        F, G = self.columns = [np.stack(known).T for known in kinds]
+        F, G = self.columns = [np.stack(known, axis=1) for known in kinds]
         weighted, edges = scan.weight[:, None] * G, [*scan.blocks.first.tolist(), len(F)]
         sums = np.stack([F[at].T @ weighted[at] for at in starmap(slice, pairwise(edges))])
         self.means = sums.reshape(len(sums), -1) / scan.blocks.weight[:, None]
