@@ -139,6 +139,11 @@ class Observations:
         added = [float(part.weight @ part.rounding) for part in self.parts if part.rounding is not None]
         return 1.0 + sum(added) / (3.0 * self.white**2 * self.samples)
 
+    def noise_square(self, noise: Noise, gain: float = 1.0) -> float:
+        """Return the mean square of the residual that noise alone leaves; ``gain``: of a filter, for white noise."""
+        white = self.less_stop_errors.expected_square * (gain * noise.white) ** 2
+        return float(np.mean(white + noise.wander**2))
+
     @cached_property
     def blocks(self) -> Blocks:
         """Short stretches of time in which the bias is assumed constant."""

@@ -51,6 +51,9 @@ STRONG_DELTA_BIC = 6.0  # delta BIC: "strong" evidence (Raftery 1995)
 ROUGH_STEP_UNCERTAINTIES = 3.0
 ROUGH_DELTA_BIC = 30.0  # below that of the best candidate, from which on a rough score is enough
 TIE = 0.5  # delta BIC below which the catalogue's order decides
+ABOVE_NOISE = (
+    1.1  # mean square of a residual over that of noise, below which effects cannot explain a part of the excess
+)
 FAR_ABOVE = 2.0  # times the noise: the residual of a model that lacks more than one effect of the catalogue
 WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
 ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share
@@ -89,7 +92,9 @@ def select(
         starts, candidates = models(observations)
         start, limits = ordinary_base(observations, noise), limits_of(observations.sensor, data_sheet)
         base = fit_best(observations, starts, start, grid)
-        settings = base.likely if search else grid
+        # where a residual is above the noise, its signal may look like noise with one effect and not without it
+        at_noise = noise is not None and base.residual_rms**2 < ABOVE_NOISE * observations.noise_square(noise)
+        settings = base.likely if search and at_noise else grid
         walks = [walk for setting, walk in random_walks(grid).items() if setting in settings]
         ranking = Ranking(observations, base, base, candidates, settings, walks=() if base.terms else walks)
         given = observations, noise, data_sheet, start, settings, walks, limits, candidates

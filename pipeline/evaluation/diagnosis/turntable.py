@@ -35,7 +35,7 @@ from pipeline.estimation.observability import alike_with_zeros, hidden_in, never
 from pipeline.estimation.observations import ROLES, Observations, observe, without_each_recording
 from pipeline.estimation.posterior import completed, curves_of, posterior
 from pipeline.estimation.ranking import projection, without
-from pipeline.estimation.selection import FAR_ABOVE, Selection, select
+from pipeline.estimation.selection import ABOVE_NOISE, FAR_ABOVE, Selection, select
 from pipeline.estimation.stages import last_fit
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, implausible
 from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, why_not_suggested
@@ -52,8 +52,6 @@ MOST_OF = 0.5  # share of the gain that the listed seconds have together
 MAX_INFLUENTIAL_STRETCHES = 5  # that a page lists
 DETERMINED = 1e-6  # least information on an effect's weakest direction, over that of all recordings
 NEEDED_RECORDING = "record turns about all three axes on a table whose angle and rate are logged"
-# mean square of a residual over that of noise below which effects cannot explain a part of the excess
-UNEXPLAINABLE_RATIO = 1.1
 NOISELESS = Noise(np.zeros(3), np.zeros(3), 1.0, "none")  # of recordings that determine no noise
 
 
@@ -239,10 +237,9 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         held_out = SelectionErrors(errors[0], errors[-1], floor)
     hidden = not_observable(reported, case.modelled)
     squares = [fit.residual_rms**2 for fit in fits]
-    reference = observations.less_stop_errors.expected_square
-    noise_square = None if noise is None else float(np.mean(reference * noise.white**2 + noise.wander**2))
+    noise_square = None if noise is None else observations.noise_square(noise)
     least = squares[-1] if noise_square is None else noise_square
-    at_noise = not reported.names and squares[0] < UNEXPLAINABLE_RATIO * least
+    at_noise = not reported.names and squares[0] < ABOVE_NOISE * least
     excess = squares[0] if at_noise else squares[0] - min(least, squares[-1])
     curves = curves_of(selection) if selection.names or unknown else []
     answers = posterior(selection, [*never_shown(hidden, reported.names), *known_harmful], curves)
@@ -294,8 +291,8 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         harmful={**known_harmful, **harmful},
         hidden={**hidden, **alike_with_zeros(reported)},
         unknown=unknown,
-        over_noise=_over_noise(selection.base, case, reference),
-        left_over_noise=_over_noise(selection.fit, case, reference),
+        over_noise=_over_noise(selection.base, case, observations),
+        left_over_noise=_over_noise(selection.fit, case, observations),
         noises=noises,
         white=float(np.sqrt(white_square)),
         expected_wander=None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
@@ -356,10 +353,10 @@ def _shares(selection: Selection, name: str) -> dict[str, float]:
     return selection.first.shares(selection.first.indices(name)[0], [], selection.alone[name].setting)
 
 
-def _over_noise(fit: JointFit, case: DiagnosisInput, reference: float) -> float | None:
-    """Return the rms residual of a fit over that of noise alone; ``reference``: ``Observations.expected_square``."""
+def _over_noise(fit: JointFit, case: DiagnosisInput, observations: Observations) -> float | None:
+    """Return the rms residual of a fit over that of noise alone."""
     if case.noise is None:
         return None
     gain = max(float(r.filter.get("noise_gain", 1.0)) for r in case.recordings)
-    floor = float(np.sqrt(np.mean(reference * (gain * case.noise.white) ** 2 + case.noise.wander**2)))
+    floor = float(np.sqrt(observations.noise_square(case.noise, gain)))
     return float(fit.residual_rms / floor) if floor > 0 else None
