@@ -165,10 +165,12 @@ def linear_truth(calibration: SensorCalibration, reading: Values) -> Values:
 
     The three products of a row are added in a fixed order, so that no rounding depends on the number of samples.
     """
-    x, y, z = np.subtract(reading.T, calibration.bias[:, None], out=np.empty((3, len(reading))))  # contiguous: faster
-    truth = np.empty((len(reading), 3))
-    for c, (along_x, along_y, along_z) in enumerate(calibration.matrix.tolist()):
-        np.add(along_x * x + along_y * y, along_z * z, out=truth[:, c])
+    truth, n = np.empty((len(reading), 3)), SAMPLES_AT_ONCE
+    for at in (slice(first, first + n) for first in range(0, len(reading), n)):
+        part = reading[at].T
+        x, y, z = np.subtract(part, calibration.bias[:, None], out=np.empty(part.shape))  # contiguous: faster
+        for c, (along_x, along_y, along_z) in enumerate(calibration.matrix.tolist()):
+            np.add(along_x * x + along_y * y, along_z * z, out=truth[at, c])
     return truth
 
 

@@ -157,7 +157,7 @@ def errors_of(calibrations: Sequence[SensorCalibration], samples: Sequence[Sampl
 def vector_errors(corrected: Sequence[Corrected], *, directed: bool) -> Values:
     """Return the errors of vectors, (n, 3), or, unless the direction is known, of their magnitudes, (n, 1)."""
     parts = [v - true if directed and true is not None else (length(v) - m)[:, None] for v, m, true in corrected]
-    return np.asarray(np.concatenate(parts))
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)  # a copy of a long recording would have 18 MB
 
 
 def with_known_effects(calibration: SensorCalibration, samples: Samples) -> Corrected:

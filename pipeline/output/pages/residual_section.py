@@ -170,7 +170,8 @@ class _BinnedMean:
 
 def _of_errors(error: Values) -> tuple[Values, Mask, Values]:
     """Return what ``_binned_mean`` needs of residuals (n, 3), for any covariate."""
-    return error, np.asarray(np.isfinite(error).all(axis=1)), np.asarray(np.mean(error**2, axis=0))
+    mean_square = np.einsum("ij,ij->j", error, error) / max(len(error), 1)  # without the squares, which may have 50 MB
+    return error, np.asarray(np.isfinite(error).all(axis=1)), np.asarray(mean_square)
 
 
 def _binned_mean(covariate: Values, error: Values, finite: Mask, mean_square: Values) -> _BinnedMean | None:
@@ -184,7 +185,11 @@ def _binned_mean(covariate: Values, error: Values, finite: Mask, mean_square: Va
     low, high = (float(covariate.min()), float(covariate.max())) if len(covariate) else (0.0, 0.0)
     if not high - low > 1e-9 * max(1.0, abs(low)):
         return None
-    cell = np.minimum(((covariate - low) * (RESIDUAL_BINS / (high - low))).astype(np.int64), RESIDUAL_BINS - 1)
+    place = covariate - low
+    place *= RESIDUAL_BINS / (high - low)  # in place: of a long recording each array has 16 MB
+    cell = place.astype(np.int64)
+    np.minimum(cell, RESIDUAL_BINS - 1, out=cell)
+    del place
     count = np.bincount(cell, minlength=RESIDUAL_BINS).astype(float)
     count[count < MIN_BIN_SAMPLES] = np.nan
     filled = np.isfinite(count)
