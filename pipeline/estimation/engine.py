@@ -65,7 +65,7 @@ from pipeline.core.records import (
     Values,
     noise_of_steps,
 )
-from pipeline.estimation.gauss_markov import TIME_FACTORS, Blocks, GaussMarkov, Setting, WanderPrior, restricted_on_grid
+from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting, WanderPrior, restricted_on_grid
 
 ONE_SIGMA, COVERED = 0.6827, 0.95  # probabilities at which the mixture and Student's t agree
 MIN_DEGREES_OF_FREEDOM = 2.0  # degrees of freedom: Student's t has no variance below
@@ -331,8 +331,7 @@ def assess_noise(  # noqa: PLR0917  (what a fit is)
     U, s, _ = np.linalg.svd(scaled, full_matrices=False)
     basis = U[:, s > AVERAGED_OUT * s[0]]
     settings = prior.grid(float(np.sqrt(np.mean(residuals**2))))
-    times = [factor * prior.time for factor in TIME_FACTORS]
-    ratios = [s.ratio for s in settings[: len(settings) // len(times)]]
+    times, ratios = ([*dict.fromkeys(values)] for values in zip(*((s.time, s.ratio) for s in settings), strict=True))
     logarithm, squares = restricted_on_grid(blocks, times, ratios, basis / np.sqrt(count), means)
     free = len(count) - basis.shape[1]
     variance = np.maximum(squares / free, np.finfo(float).tiny)

@@ -178,8 +178,10 @@ class Ranking:
         scores = {}
         for index in by_size([self.blocks[j].shape for j in able]):
             members = [able[k] for k in index]
-            for j, score, likelihoods in self._scored(members, products, before, limits):
+            for j, score, likelihoods, explained in self._scored(members, products, before, limits):
                 scores[j], self._with[*selected, j] = score, likelihoods
+                if not selected:
+                    self._explained[j] = explained
         best: dict[str, Score] = {}
         for _, score in sorted(scores.items()):
             if score.name not in best or score.delta_bic > best[score.name].delta_bic:
@@ -188,8 +190,8 @@ class Ranking:
 
     def _scored(
         self, members: Sequence[int], products: Values, before: float, limits: dict[str, Values]
-    ) -> Iterator[tuple[int, Score, Values]]:
-        """Yield index, score and log likelihoods of candidates with equal numbers of directions."""
+    ) -> Iterator[tuple[int, Score, Values, float]]:
+        """Yield index, score, log likelihoods, and what it explains under white noise, of candidates of equal size."""
         places = [slice(self.places[j][0], self.places[j][-1] + 1) for j in members]
         inner = np.stack([products[:, at, at] for at in places])
         cross = np.stack([products[:, at, -1] for at in places])
@@ -199,8 +201,6 @@ class Ranking:
         solved = np.linalg.solve(definite, cross[..., None])[..., 0]
         explained = np.sum(cross * solved, axis=2)
         rss = products[:, -1, -1] - explained
-        if products is self.products:
-            self._explained |= zip(members, explained[:, 0].tolist(), strict=True)
         likelihood = self.log_likelihood(rss)
         weakest = np.linalg.eigvalsh(inner[:, 0])[:, 0]
         likeliest, row = np.argmax(likelihood[:, 1:], axis=1) + 1, np.arange(len(members))
@@ -221,7 +221,7 @@ class Ranking:
             p, admissible = float(scipy.special.chdtrc(k, gain)), bool(weakest[i] > MIN_NEW_VARIANCE)
             delta_bic = gain - k * of_one
             score = Score(this.name, delta_bic, p, k, values, uncertainty, best, admissible, plausible, drops[i])
-            yield j, score, likelihood[i]
+            yield j, score, likelihood[i], float(explained[i, 0])
 
     def shares(self, j: int, selected: Sequence[int], setting: int) -> dict[str, float]:
         """Return the share of candidate j's fitted signal that each other effect reproduces.

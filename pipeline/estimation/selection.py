@@ -51,9 +51,7 @@ STRONG_DELTA_BIC = 6.0  # delta BIC: "strong" evidence (Raftery 1995)
 ROUGH_STEP_UNCERTAINTIES = 3.0
 ROUGH_DELTA_BIC = 30.0  # below that of the best candidate, from which on a rough score is enough
 TIE = 0.5  # delta BIC below which the catalogue's order decides
-ABOVE_NOISE = (
-    1.1  # mean square of a residual over that of noise, below which effects cannot explain a part of the excess
-)
+ABOVE_NOISE = 1.1  # mean square of a residual over that of noise, below which effects explain no part of the excess
 FAR_ABOVE = 2.0  # times the noise: the residual of a model that lacks more than one effect of the catalogue
 WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
 ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share

@@ -51,7 +51,7 @@ import numpy as np
 from imu_logs.log import Log, Note
 from imu_logs.units import ATTITUDE, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError
-from pipeline.core.records import Index, Mask, Values, conjugate_product, continuous, level_in_body
+from pipeline.core.records import Index, Mask, Values, continuous, level_in_body, rotation_deg
 from pipeline.core.settings import ProgramRest, ProgramTurn, Repeated
 
 ENCODER_STEP_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
@@ -144,7 +144,7 @@ def signals_of(log: Log) -> Signals:
     interval = float(np.median(np.diff(log_time)))
     if ATTITUDE[0] in found:
         q = np.column_stack([found[c](grid) for c in ATTITUDE])
-        rates = np.degrees(2.0 * conjugate_product(q, np.gradient(q, step, axis=0)))  # 2 vec(conj(q) dq/dt)
+        rates = rotation_deg(q, np.gradient(q, step, axis=0))
         return Signals(step, rates, level_in_body(q), interval)
     if "table_angle" in found:
         angle = found["table_angle"](grid)

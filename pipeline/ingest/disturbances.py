@@ -39,11 +39,11 @@ from pipeline.core.records import (
     Note,
     Recording,
     Values,
-    conjugate_product,
     continuous,
     level_in_body,
     median,
     noise_of_steps,
+    rotation_deg,
 )
 from pipeline.ingest.quality_flags import GAP
 
@@ -200,7 +200,7 @@ class _Motion:
         r = self.recording
         if r.table_attitude is not None and np.isfinite(r.table_attitude).all():
             q = continuous(r.table_attitude)
-            rate = np.degrees(2.0 * conjugate_product(q[:-1], q[1:])) / r.time_steps[:, None]
+            rate = rotation_deg(q[:-1], q[1:]) / r.time_steps[:, None]
             return np.concatenate([rate, rate[-1:]])
         if r.table_rate is not None:
             return r.table_rate[:, None]

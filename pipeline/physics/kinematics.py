@@ -32,12 +32,12 @@ from pipeline.core.records import (
     Recording,
     Values,
     attitude_matrix,
-    conjugate_product,
     continuous,
     cross,
     level_in_body,
     once_of_log,
     quintic_spline,
+    rotation_deg,
 )
 from pipeline.core.settings import Table
 from pipeline.physics.signal.encoder_rate import EncoderTrajectory, Pieces, rate_by_angle
@@ -214,11 +214,11 @@ def _motion_of_attitude(
         offset = before + offset
         table_time = (time + offset) * clock
         q = cache(lambda: spline(table_time) if np.any(offset) else attitude)
-        omega = cache(lambda: _twice_in_degrees(conjugate_product(q(), spline(table_time, 1))))
+        omega = cache(lambda: rotation_deg(q(), spline(table_time, 1)))
         deferred: dict[str, Any] = {
             "specific_force": lambda: gravity_g * level_in_body(q()),
             "angular_rate": lambda: omega() if earth is None else omega() + earth_in_body(earth, attitude_matrix(q())),
-            "angular_acceleration": lambda: _twice_in_degrees(conjugate_product(q(), spline(table_time, 2))),
+            "angular_acceleration": lambda: rotation_deg(q(), spline(table_time, 2)),
             "specific_force_rate": lambda: gravity_g * cross(level_in_body(q()), np.radians(omega())),
             "level": lambda: attitude_matrix(q()),
             "still": lambda: still_samples(time, np.linalg.norm(omega(), axis=1)),
@@ -230,12 +230,6 @@ def _motion_of_attitude(
         )
 
     return at(0.0)
-
-
-def _twice_in_degrees(halves: Values) -> Values:
-    """Return twice an array of radians in degrees, in its place: of a long recording it has 18 MB a million rows."""
-    halves *= 2.0
-    return np.asarray(np.degrees(halves, out=halves))
 
 
 def turn_about_axis(vector: Values, axis: int, angle_deg: Values) -> Values:

@@ -27,7 +27,7 @@ COMMAND = [sys.executable, "-PS", str(Path(__file__).with_name("job_command.py")
 # Large pages save another 2 %, where the system lets a program ask for them.
 KEEP_FREED_MEMORY = dict.fromkeys(("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"), "500000000")
 KEEP_FREED_MEMORY |= {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
-# Arrow's own pool keeps what it frees beside that: an hour at 1 kHz, unexplained, then needs 1.62 GB in place of 1.44.
+# Arrow's own pool keeps what it frees beside that: an hour at 1 kHz, unexplained, then needed 0.2 GB more.
 KEEP_FREED_MEMORY |= {"ARROW_DEFAULT_MEMORY_POOL": "system"}
 # Containers that are made and not freed until Python searches them for cycles. With 700, its default, this takes 5 ms a
 # unit, with 10,000 2 ms; without it 100 units need 630 MB in place of 440.

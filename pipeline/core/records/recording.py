@@ -435,6 +435,16 @@ def conjugate_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray
     return product
 
 
+def rotation_deg(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``2 vec(conj(p) q)`` in degrees of quaternions of shape (n, 4): (n, 3).
+
+    It is the rotation from p to q where that is small, and the rate in the body frame where q is the derivative of p.
+    """
+    product = conjugate_product(p, q)
+    product *= 2.0
+    return np.asarray(np.degrees(product, out=product))
+
+
 def attitude_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation matrices of unit quaternions: (n, 4) to (n, 3, 3), body vectors to level vectors."""
     w, x, y, z = q.T

@@ -185,11 +185,7 @@ def _binned_mean(covariate: Values, error: Values, finite: Mask, mean_square: Va
     low, high = (float(covariate.min()), float(covariate.max())) if len(covariate) else (0.0, 0.0)
     if not high - low > 1e-9 * max(1.0, abs(low)):
         return None
-    place = covariate - low
-    place *= RESIDUAL_BINS / (high - low)  # in place: of a long recording each array has 16 MB
-    cell = place.astype(np.int64)
-    np.minimum(cell, RESIDUAL_BINS - 1, out=cell)
-    del place
+    cell = np.minimum(((covariate - low) * (RESIDUAL_BINS / (high - low))).astype(np.int64), RESIDUAL_BINS - 1)
     count = np.bincount(cell, minlength=RESIDUAL_BINS).astype(float)
     count[count < MIN_BIN_SAMPLES] = np.nan
     filled = np.isfinite(count)
