@@ -17,14 +17,15 @@ with the prior ``N(0, u^2)``. With their columns T, scaled by u, they are elimin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import groupby, pairwise
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
+import scipy
 
 from pipeline.core.errors import InputError, NotObservableError
 from pipeline.core.records import BASE_COUNT, DEFERRED, MATRIX_ROWS, Index, Motion, Noise, Values, motion_at_rest
@@ -42,7 +43,6 @@ MOTION_FIELDS = (  # fields of ``Motion`` on which formulas depend
     "time", "specific_force", "angular_rate", "angular_acceleration", "temperature", "angle", "rate", "level",
     "direction", "temperature_rate",
 )  # fmt: skip
-Result = TypeVar("Result")
 JoinedMotions: TypeAlias = "list[tuple[Motion, list[Motion]]]"  # one for several recordings, and those that it joins
 
 
@@ -248,35 +248,23 @@ class Design:
             inner = Q.T @ (root * A[:, 4:])
             A[:, 4:] -= A[:, :4] @ np.linalg.solve(R, inner)
         self.columns = Products(observations.blocks, weight, A)
-        self.stops, self._own, self._at = 0, [self.columns] * 3, list(self._local)
-        if observations.angle_deg > 0.0:
-            self._add_stops(observations, terms, K)
-        width, count = self._own[0].columns.shape[1], self.count + 1 + self.stops
-        self._from = [np.add.outer(at * width, at).ravel() for at in self._at]
-        self._to = [np.add.outer(index * count, index).ravel() for index in self._total]
+        self.stops = self._errors_of_stops(observations, terms, K) if observations.angle_deg > 0.0 else []
+        self._from = [np.add.outer(at * self._width, at).ravel() for at in self._local]
+        self._to = [np.add.outer(index * (self.count + 1), index).ravel() for index in self._total]
 
     def reweighted(self, observations: Observations) -> Design:
         """Return the design of the same rows with other weights."""
         found, blocks, weight = copy(self), observations.blocks, observations.weight
         found.columns = Products(blocks, weight, self.columns.columns)
-        found._own = [found.columns] * 3  # noqa: SLF001
-        if self.stops:
-            found._own = [Products(blocks, weight, own.columns) for own in self._own]  # noqa: SLF001
         return found
 
-    def _add_stops(self, observations: Observations, terms: Terms, K: Values) -> None:
-        """Add the errors of the angle, as parameters after the readings, with separate columns for each axis."""
+    def _errors_of_stops(self, observations: Observations, terms: Terms, K: Values) -> list[scipy.sparse.csr_array]:
+        """Return the columns of the errors of the angle, one for each stop and of unit variance, for each axis."""
         motions = [true_motion(part, terms) for part in observations.parts]
         before, after, stop, last = errors_of_stops(observations.sensor, motions, K)
-        self.stops = last + 1
-        A, rows, blocks = self.columns.columns, np.arange(len(stop)), observations.blocks
-        for c in range(3):
-            T = np.zeros((len(rows), self.stops))
-            T[rows, stop] = observations.angle_deg * before[:, c]
-            T[rows, stop + 1] = observations.angle_deg * after[:, c]
-            self._own[c] = Products(blocks, observations.weight, np.hstack([A[:, self._local[c]], T]))
-            self._total[c] = np.append(self._total[c], self.count + 1 + np.arange(self.stops))
-            self._at[c] = np.arange(len(self._total[c]))
+        change = observations.angle_deg * np.concatenate([before, after])
+        places, shape = (np.tile(np.arange(len(stop)), 2), np.append(stop, stop + 1)), (len(stop), last + 1)
+        return [scipy.sparse.csr_array((of_axis, places), shape) for of_axis in change.T]
 
     def _place(self, sensor: str, terms: Terms) -> None:
         """Assign to each axis its columns of A, and the parameter of each column."""
@@ -333,28 +321,30 @@ class Design:
 
     def places(self, c: int) -> tuple[Index, Index]:
         """Return the indices of the columns of one axis in A, and their parameters; the readings last."""
-        return self._local[c], self._total[c][: len(self._local[c])]
+        return self._local[c], self._total[c]
 
     def products(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
         """Return all products of parameters' columns and, last, the readings, (g, p + 1, p + 1); and log det C, (g,).
 
         The priors are added, and errors of the angle are eliminated. ``log det C`` lacks a constant.
         """
-        whole, logarithms = self._with_stops(settings)
+        own, logarithms = self._without_stops(settings)
         if not self.stops:
-            return whole, logarithms
-        p = self.count + 1
-        cross, inner = whole[:, p:, :p], whole[:, p:, p:]
-        rest = whole[:, :p, :p] - cross.transpose(0, 2, 1) @ np.linalg.solve(inner, cross)
-        return rest, logarithms + np.linalg.slogdet(inner)[1]
+            return own, logarithms
+        cross, inner = self._with_stops(settings)
+        factor = np.linalg.cholesky(inner)
+        for i, (L, products) in enumerate(zip(factor, cross, strict=True)):
+            half = scipy.linalg.solve_triangular(L, products, lower=True, check_finite=False)
+            own[i] -= half.T @ half
+        return own, logarithms + 2.0 * np.sum(np.log(np.einsum("gss->gs", factor)), axis=1)
 
-    def _with_stops(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
-        """Return ``products`` with the errors of the angle as the last parameters."""
-        last, count = self.count, self.count + 1 + self.stops
-        total = np.zeros((len(settings), count**2))
-        of_axes = self._of_axes(lambda own: own.products(settings))
-        for c, (products, _) in enumerate(of_axes):
-            total[:, self._to[c]] += products.reshape(len(settings), -1).take(self._from[c], 1) / self.scale[c] ** 2
+    def _without_stops(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
+        """Return ``products`` as if the angle had no errors at the stops."""
+        last, count = self.count, self.count + 1
+        of_columns, logarithms = self.columns.products(settings)
+        of_columns, total = of_columns.reshape(len(settings), -1), np.zeros((len(settings), count**2))
+        for to, at, scale in zip(self._to, self._from, self.scale, strict=True):
+            total[:, to] += of_columns.take(at, 1) / scale**2
         square = total.reshape(-1, count, count)
         for at, term, prior in self._priors:  # as readings of the parameters themselves
             rest = prior.mean - term.values
@@ -362,24 +352,34 @@ class Design:
             square[:, at, last] += prior.precision @ rest
             square[:, last, at] += prior.precision @ rest
             square[:, last, last] += rest @ prior.precision @ rest
-        of_stops = np.arange(last + 1, count)
-        square[:, of_stops, of_stops] += 1.0
-        return square, np.sum([logarithm for _, logarithm in of_axes], axis=0)
+        return square, 3.0 * logarithms
 
-    def _of_axes(self, compute: Callable[[Products], Result]) -> list[Result]:
-        """Return what is computed from the columns of each axis; without stops, all axes have the same columns."""
-        if not self.stops:
-            return [compute(self.columns)] * 3
-        return [compute(own) for own in self._own]
+    def _with_stops(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
+        """Return the products of the s columns of stops with the parameters', (g, s, p + 1), and ``1 + T^T C^-1 T``."""
+        of_rows, blocks, s = self.columns, self.columns.blocks, self.stops[0].shape[1]
+        weight, of_blocks = (scipy.sparse.diags_array(w) for w in (of_rows.weight, 1.0 / blocks.weight))
+        n, model = len(of_rows.weight), blocks.model(tuple(settings))
+        sums = scipy.sparse.csr_array((of_rows.weight, (blocks.label(n), np.arange(n))))  # over the rows of each block
+        whitened = model.whitened(of_rows.means)
+        cross, inner = np.zeros((len(settings), s, self.count + 1)), np.tile(np.eye(s), (len(settings), 1, 1))
+        for T, local, total, scale in zip(self.stops, self._local, self._total, self.scale, strict=True):
+            of_stops, columns, means = sums @ T, of_rows.columns[:, local], of_rows.means[:, local]
+            own = model.whitened((of_blocks @ of_stops).toarray() / scale)
+            inner += (T.T @ weight @ T - of_stops.T @ of_blocks @ of_stops).toarray() / scale**2
+            inner += own @ own.transpose(0, 2, 1)
+            within = (T.T @ (weight @ columns) - of_stops.T @ means) / scale**2
+            cross[:, :, total] += within + own @ whitened[:, local].transpose(0, 2, 1) / scale
+        return cross, inner
 
     def linear_map(self, setting: Setting) -> LinearMap:
         """Return the linear map from small changes of the readings to the parameters, under a noise setting."""
         inverse, weights, derivative = self._inverse(setting), [], []
-        of_axes = self._of_axes(lambda own: own.influence(setting))
-        for influence, at, total, scale in zip(of_axes, self._at, self._total, self.scale, strict=True):
-            free = total != self.count  # the readings lie between parameters and stops
-            weights.append(influence[at[free]])
-            derivative.append(inverse[: self.count, (total - (total > self.count))[free]] / scale**2)
+        influence, stops = self.columns.influence(setting), np.arange(self.count, len(inverse))
+        rows = self.columns.blocks, self.columns.weight
+        of_stops = [Products(*rows, T.toarray()).influence(setting) for T in self.stops] or [influence[:0]] * 3
+        for own, local, total, scale in zip(of_stops, self._local, self._total, self.scale, strict=True):
+            weights.append(np.concatenate([influence[local[:-1]], own]))  # without the readings, which are last
+            derivative.append(inverse[: self.count, np.append(total[:-1], stops)] / scale**2)
         return LinearMap(tuple(weights), tuple(derivative))
 
     def prior_covariances(self, setting: Setting) -> dict[str, Values]:
@@ -389,8 +389,11 @@ class Design:
 
     def _inverse(self, setting: Setting) -> Values:
         """Return the inverse of the products of the columns of parameters and stops: (q, q) array."""
-        gram = self._with_stops([setting])[0][0]
-        return scaled_inverse(np.delete(np.delete(gram, self.count, 0), self.count, 1))
+        gram = self._without_stops([setting])[0][0, : self.count, : self.count]
+        if self.stops:
+            (cross,), (inner,) = self._with_stops([setting])
+            gram = np.block([[gram, cross[:, :-1].T], [cross[:, :-1], inner]])
+        return scaled_inverse(gram)
 
     def sizes(self) -> Values:
         """Return the norm of each parameter's column before the projection: (p + 1,) array."""
