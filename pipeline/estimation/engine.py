@@ -46,7 +46,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import scipy
@@ -65,7 +65,7 @@ from pipeline.core.records import (
     Values,
     noise_of_steps,
 )
-from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting, WanderPrior, restricted_on_grid
+from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting, WanderPrior, on_ratios, restricted_on_grid
 
 ONE_SIGMA, COVERED = 0.6827, 0.95  # probabilities at which the mixture and Student's t agree
 MIN_DEGREES_OF_FREEDOM = 2.0  # degrees of freedom: Student's t has no variance below
@@ -386,14 +386,20 @@ def _outside(X: Values, y: Values, blocks: Blocks, settings: Sequence[Setting]) 
         e, V = np.linalg.eigh(root[:, None] * blocks.covariance(tau) * root)
         columns = np.ascontiguousarray((V.T @ channels).transpose(2, 0, 1))
         chosen = [k for k, s in enumerate(settings) if s.time == tau]
-        spectrum = 1.0 + np.outer([settings[k].ratio ** 2 for k in chosen], np.clip(e, 0.0, None))
-        whitened = (columns / np.sqrt(spectrum)[:, None, None, :]).reshape(len(chosen), len(columns), -1)
-        products = whitened @ whitened.transpose(0, 2, 1)
-        products[:, -1, -1] += np.finfo(float).tiny  # readings without noise
-        pivots = np.einsum("gkk->gk", np.linalg.cholesky(products))
-        logarithm[chosen] = 3.0 * np.log(spectrum).sum(axis=1) + 2.0 * np.log(pivots[:, :-1]).sum(axis=1)
-        squares[chosen] = pivots[:, -1] ** 2
+        of_tau = on_ratios([settings[k].ratio for k in chosen], partial(_of_spectrum, np.clip(e, 0.0, None), columns))
+        logarithm[chosen], squares[chosen] = of_tau[0], of_tau[1][:, 0]
     return logarithm, squares
+
+
+def _of_spectrum(e: Values, columns: Values, ratios: Sequence[float]) -> tuple[Values, Values]:
+    """Return ``_outside`` at r ratios, (r,) and (r, 1), by (m,) eigenvalues of E and (k + 1, 3, m) columns there."""
+    spectrum = 1.0 + np.outer(np.square(ratios), e)
+    whitened = (columns / np.sqrt(spectrum)[:, None, None, :]).reshape(len(ratios), len(columns), -1)
+    products = whitened @ whitened.transpose(0, 2, 1)
+    products[:, -1, -1] += np.finfo(float).tiny  # readings without noise
+    pivots = np.einsum("gkk->gk", np.linalg.cholesky(products))
+    logarithm = 3.0 * np.log(spectrum).sum(axis=1) + 2.0 * np.log(pivots[:, :-1]).sum(axis=1)
+    return logarithm, pivots[:, -1:] ** 2
 
 
 def derivative(function: Callable[[Values], Values], x: Values, step: Values) -> Values:

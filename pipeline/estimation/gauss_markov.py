@@ -26,7 +26,7 @@ Thompson, Biometrika 58, 1971 (restricted likelihood).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -55,7 +55,7 @@ LARGEST_SPAN = 1e9  # of variances that a factorisation resolves: 1e7 times the 
 SLOW_SPECTRUM_SHARE = 0.3
 # correlation time below which ``information`` replaces the model, because its blocks last seconds
 MIN_MODELLED_TIME_S = 25.0
-# between the logarithms of ratios at which ``restricted_on_grid`` computes a likelihood: of 24 units on a table, no
+# between the logarithms of ratios at which ``on_ratios`` computes a likelihood: of 24 units on a table, no
 # expanded uncertainty changes by more than 0.05 %
 KNOT_STEP = 0.55
 CACHED = 16384  # numbers of ``GaussMarkov.squares`` that stay in the processor's cache: 128 kB
@@ -387,18 +387,30 @@ class GaussMarkov:
 def restricted_on_grid(
     blocks: Blocks, times: Sequence[float], ratios: Sequence[float], design: Values, values: Values
 ) -> tuple[Values, Values]:
-    """Return ``GaussMarkov.restricted`` at each of t times with each of r rising ratios: (t r,) and (t r, c) arrays.
+    """Return ``GaussMarkov.restricted`` at each of t times with each of r rising ratios: (t r,) and (t r, c) arrays."""
+    of_blocks = np.stack([blocks.weight, blocks.start, blocks.length, blocks.clock]).tobytes()
+
+    def restricted(some: Sequence[float]) -> tuple[Values, Values]:
+        logarithm, squares = _model(of_blocks, tuple(times), tuple(some)).restricted(design, values)
+        return logarithm.reshape(len(times), -1), squares.reshape(len(times), len(some), -1)
+
+    logarithm, squares = on_ratios(ratios, restricted)
+    return logarithm.ravel(), squares.reshape(-1, squares.shape[-1])
+
+
+def on_ratios(
+    ratios: Sequence[float], restricted: Callable[[Sequence[float]], tuple[Values, Values]]
+) -> tuple[Values, Values]:
+    """Return log det, (..., r), and squares, (..., r, c), of a restricted likelihood at each of r rising ratios.
 
     log det and log squares are smooth in log q: C has the spectrum 1 + q e with e >= 0, in units of v. They are
-    interpolated between fewer ratios. Both are monotone in q, and so stay between those of the knots.
+    interpolated where fewer ratios are enough. Both are monotone in q, and so stay between those of the knots.
     """
     knots, weights = _knots(tuple(ratios))
-    of_blocks = np.stack([blocks.weight, blocks.start, blocks.length, blocks.clock]).tobytes()
-    logarithm, squares = _model(of_blocks, tuple(times), tuple(knots)).restricted(design, values)
-    known = np.column_stack([logarithm, np.log(np.maximum(squares, np.finfo(float).tiny))])
-    known = known.reshape(len(times), len(knots), -1)
-    found = np.clip(weights @ known, known.min(axis=1, keepdims=True), known.max(axis=1, keepdims=True))
-    return found[..., 0].ravel(), np.exp(found[..., 1:]).reshape(-1, squares.shape[1])
+    logarithm, squares = restricted(knots)
+    known = np.concatenate([logarithm[..., None], np.log(np.maximum(squares, np.finfo(float).tiny))], axis=-1)
+    found = np.clip(weights @ known, known.min(axis=-2, keepdims=True), known.max(axis=-2, keepdims=True))
+    return found[..., 0], np.exp(found[..., 1:])
 
 
 @lru_cache(maxsize=1)  # both sensors of a recording have the same blocks
@@ -411,9 +423,15 @@ def _model(of_blocks: bytes, times: tuple[float, ...], ratios: tuple[float, ...]
 
 @lru_cache(maxsize=4)  # grids of ratios
 def _knots(ratios: tuple[float, ...]) -> tuple[list[float], Values]:
-    """Return k ratios, also 0 if it is one, and the (r, k) weights of the natural quintic spline through them."""
+    """Return k ratios, also 0 if it is one, and the (r, k) weights of the natural quintic spline through them.
+
+    They are the ratios themselves if the spline needs as many.
+    """
     x = np.log([ratio for ratio in ratios if ratio > 0.0])
-    at = np.linspace(x[0], x[-1], 1 + math.ceil((x[-1] - x[0]) / KNOT_STEP))
+    steps = math.ceil(float(np.ptp(x)) / KNOT_STEP) if len(x) else 0
+    if len(x) <= steps + 3:
+        return [*ratios], np.eye(len(ratios))
+    at = np.linspace(x[0], x[-1], 1 + steps)
     at = np.sort(np.append(at, [at[:2].mean(), at[-2:].mean()]))  # a natural spline bends too little at its ends
     k, zero, both = len(at), len(ratios) - len(x), np.append(at, x)
     basis = np.column_stack([np.abs(both[:, None] - at) ** 5, np.vander(both, 3)])
