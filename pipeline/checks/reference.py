@@ -39,7 +39,7 @@ a doubt.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,6 +72,7 @@ from pipeline.checks.reference_scale import (
 from pipeline.core.records import Index, Mask, Note, Recording, Values, median, once
 from pipeline.core.settings import Settings
 
+ByGravity = Callable[[], Channel | None]
 Stretches = tuple[str, int, int, int]  # text with the places {name} and {names}; number of rows, first and last sample
 
 
@@ -105,32 +106,44 @@ class ChannelComparison:
         self.recording, self.channels, self.limits = recording, channels, limits
         self.dt = recording.time_steps
         self.interval = recording.interval
-        self._summed: dict[tuple[str, int], tuple[Values, Values, Values, Values]] = {}  # by channel and size
+        self._parts: dict[str, Values] = {}  # of the sums, by channel
+        self._found: dict[tuple[frozenset[str], int], Values] = {}  # by two channels, in any order, and size
         self.known = np.ones(len(self.dt), bool)  # intervals in which every channel is known
         for channel in channels:
             finite = np.isfinite(channel.low)
             self.known &= finite if channel.of_intervals else finite[1:] & finite[:-1]
 
-    def find(self, claim: Channel) -> tuple[bool, Note] | None:
-        """Return whether no effect of the catalogue explains a contradiction, and the note on it; None without one."""
-        others = [c for c in self.channels if c is not claim and (c.name != "gravity" or claim.name == "table_angle")]
-        if not others or claim.name in OF_SENSOR:
+    def find(self, claim: Channel, by_gravity: ByGravity) -> tuple[bool, Note] | None:
+        """Return whether no effect of the catalogue explains a contradiction, and the note on it; None without one.
+
+        ``by_gravity``: called where the others contradict the table's angle, with which alone gravity is compared.
+        """
+        if claim.name in OF_SENSOR:
             return None
-        alone = all(w.name in OF_SENSOR for w in others)
-        rows: list[tuple[Values, Values]] = []  # effects allow at least what the stated accuracy allows
-        doubtful = True
-        while len(rows) < len(others) and doubtful:
-            rows.append(self._rows(claim, others[len(rows)], alone=alone))
-            doubtful = bool((np.min([doubt for _, doubt in rows], axis=0) > 0.0).any())
-        gross, doubt = zip(*rows, strict=True)
-        contradiction = (doubtful and self._worst_row(claim, others, gross)) or self._worst_stretch(claim, others)
-        found = contradiction or (doubtful and self._worst_row(claim, others, doubt))
+        others = [c for c in self.channels if c is not claim]
+        found = self._contradiction(claim, others)
+        if found and claim.name == "table_angle" and (gravity := by_gravity()):
+            others.append(gravity)
+            found = self._contradiction(claim, others)
         if not found:
             return None
         name, *names = (self.limits.column(self.recording, c.name) for c in (claim, *others))
-        text, count, first, last = found
+        gross, (text, count, first, last) = found
         t, detail = self.recording.time, text.format(name=name, names=" and ".join(names))
-        return contradiction is not None, Note("N-REFERENCE", count, 0, 0, detail, float(t[first]), float(t[last]))
+        return gross, Note("N-REFERENCE", count, 0, 0, detail, float(t[first]), float(t[last]))
+
+    def _contradiction(self, claim: Channel, others: list[Channel]) -> tuple[bool, Stretches] | None:
+        """Return whether no effect explains the contradiction of a channel to all others, and its place."""
+        alone = all(w.name in OF_SENSOR for w in others)
+        rows, doubtful = list[tuple[Values, Values]](), True  # effects allow at least what the stated accuracy allows
+        while len(rows) < len(others) and doubtful:
+            rows.append(self._rows(claim, others[len(rows)], alone=alone))
+            doubtful = bool((np.minimum.reduce([doubt for _, doubt in rows]) > 0.0).any())
+        gross, doubt = zip(*rows, strict=True)
+        if found := (doubtful and self._worst_row(claim, others, gross)) or self._worst_stretch(claim, others):
+            return True, found
+        found = self._worst_row(claim, others, doubt) if doubtful else None
+        return (False, found) if found else None
 
     def _rows(self, claim: Channel, other: Channel, *, alone: bool) -> tuple[Values, Values]:
         """Return the excess of each value over what another channel allows: by effects, by accuracy: (m,) arrays."""
@@ -175,24 +188,11 @@ class ChannelComparison:
         return text, rows.size, first, last
 
     def _worst_stretch(self, claim: Channel, others: list[Channel]) -> Stretches | None:
-        limits, n = self.limits, len(self.dt)
+        n = len(self.dt)
         for size in sorted({SHORT_STRETCH_SAMPLES, max(n // LONG_STRETCHES, SHORT_STRETCH_SAMPLES)}):
-            starts = np.arange(0, max(n - size // 2, 1), size)
-            turned, total, bends, _ = self._sums(claim, size, starts)
-            excess, sums = [], []
+            starts, excess = np.arange(0, max(n - size // 2, 1), size), list[Values]()
             for other in others:
-                shown, shown_total, shown_bends, swing = self._sums(other, size, starts)
-                most = np.maximum(total, shown_total)
-                allowed = limits.rate * most + BENDS * np.sqrt(bends + shown_bends) + RESOLVED_DEG
-                if claim.of_intervals or other.of_intervals:
-                    allowed += limits.angle_deg
-                if other.name in OF_SENSOR:
-                    length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)
-                    share = PHASE if other.name == "gravity" else limits.gain
-                    noise = BY_NOISE * other.noise * self.interval * (1.0 if other.of_intervals else np.sqrt(size))
-                    allowed += share * most + limits.late_s * swing + limits.offset_dps * length + noise
-                excess.append(np.abs(turned - shown) - allowed)
-                sums.append(shown)
+                excess.append(self._excess(claim, other, size, starts))
                 if (excess[-1] <= 0.0).all():
                     break
             else:
@@ -201,30 +201,47 @@ class ChannelComparison:
                 if not rows.size:
                     continue
                 worst = int(np.argmax(off))
-                shown = sums[int(np.argmin([e[worst] for e in excess]))]
+                nearest = others[int(np.argmin([e[worst] for e in excess]))]
+                turned, shown = (self._sums(channel, starts)[0, worst] for channel in (claim, nearest))
                 first, last = int(starts[rows[0]]), min(int(starts[rows[-1]]) + size, n)
                 part = getattr(self.recording, claim.name)[first : last + 1]
                 text = (
                     f"{{name}}{' stays the same and' if np.all(part == part[0]) else ''} contradicts {{names}} in "
-                    f"{place(self.recording, first, last)}: it turns by {turned[worst]:.4g} deg and they by "
-                    f"{shown[worst]:.4g} deg in one of {rows.size} such stretches"
+                    f"{place(self.recording, first, last)}: it turns by {turned:.4g} deg and they by {shown:.4g} deg "
+                    f"in one of {rows.size} such stretches"
                 )
                 return text, rows.size, first, last
         return None
 
-    def _sums(self, channel: Channel, size: int, starts: Index) -> tuple[Values, Values, Values, Values]:
-        """Return for each stretch: angle, sum of its magnitudes, squared error by bends, and range of the rate."""
-        if (channel.name, size) in self._summed:
-            return self._summed[channel.name, size]
-        turned, bend = np.where(self.known, channel.turned, 0.0), np.zeros(len(self.dt))
-        rate = np.where(self.known, channel.low if channel.of_intervals else channel.low[1:], 0.0)
-        if not channel.of_intervals:
-            steps = np.diff(np.where(np.isfinite(channel.low), channel.low, 0.0))
-            bend = (np.where(self.known, 0.5 * steps, 0.0) * self.dt) ** 2
-        swing = np.maximum.reduceat(rate, starts) - np.minimum.reduceat(rate, starts)
-        angle, total, bends = (np.add.reduceat(v, starts) for v in (turned, np.abs(turned), bend))
-        self._summed[channel.name, size] = angle, total, bends, swing
-        return angle, total, bends, swing
+    def _excess(self, claim: Channel, other: Channel, size: int, starts: Index) -> Values:
+        """Return by how much two channels differ in each stretch beyond what is allowed: (k,) array, deg."""
+        limits, key = self.limits, (frozenset((claim.name, other.name)), size)
+        if key in self._found:
+            return self._found[key]
+        (turned, total, bends), (shown, shown_total, shown_bends) = (self._sums(c, starts) for c in (claim, other))
+        most = np.maximum(total, shown_total)
+        allowed = limits.rate * most + BENDS * np.sqrt(bends + shown_bends) + RESOLVED_DEG
+        if claim.of_intervals or other.of_intervals:
+            allowed += limits.angle_deg
+        if other.name in OF_SENSOR:
+            length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)
+            rate = np.where(self.known, other.low if other.of_intervals else other.low[1:], 0.0)
+            swing = np.maximum.reduceat(rate, starts) - np.minimum.reduceat(rate, starts)
+            share = PHASE if other.name == "gravity" else limits.gain
+            noise = BY_NOISE * other.noise * self.interval * (1.0 if other.of_intervals else np.sqrt(size))
+            allowed += share * most + limits.late_s * swing + limits.offset_dps * length + noise
+        self._found[key] = np.abs(turned - shown) - allowed
+        return self._found[key]
+
+    def _sums(self, channel: Channel, starts: Index) -> Values:
+        """Return for each stretch: angle, sum of its magnitudes, and squared error by bends: (3, k) array."""
+        if channel.name not in self._parts:
+            turned, bend = np.where(self.known, channel.turned, 0.0), np.zeros(len(self.dt))
+            if not channel.of_intervals:
+                steps = np.diff(np.where(np.isfinite(channel.low), channel.low, 0.0))
+                bend = (np.where(self.known, 0.5 * steps, 0.0) * self.dt) ** 2
+            self._parts[channel.name] = np.stack([turned, np.abs(turned), bend])
+        return np.asarray(np.add.reduceat(self._parts[channel.name], starts, axis=1))
 
 
 def _near(other: Channel, claim: Channel, reach: int) -> tuple[Values, Values, Values]:
@@ -380,10 +397,12 @@ def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: ChannelLimi
     measured = gyroscope.along(recording, axis)
     if measured is not None:
         channels.append(of_rate(recording, "gyroscope", measured, recording.valid))
-    phase = gravity_turned(recording)
-    if phase is not None and recording.table_angle is not None:
-        channels.append(of_gravity(recording, phase, channels))
-    notes, delay = _compare(recording, channels, limits)
+
+    def by_gravity() -> Channel | None:
+        phase = gravity_turned(recording)
+        return None if phase is None else of_gravity(recording, phase, channels)
+
+    notes, delay = _compare(recording, channels, limits, by_gravity)
     ends = float(recording.time[0]), float(recording.time[-1])
     for doubt in filter(None, (doubt_of_scale(recording, limits), doubt_of_angle(recording, limits))):
         notes.append(Note("N-REFERENCE", recording.samples, 0, 0, doubt, *ends))
@@ -406,17 +425,17 @@ def _check_motion(
 
 
 def _compare(
-    recording: Recording, channels: Sequence[Channel], limits: ChannelLimits
+    recording: Recording, channels: Sequence[Channel], limits: ChannelLimits, by_gravity: ByGravity = lambda: None
 ) -> tuple[list[Note], Delay | None]:
     """Compare each channel of the table's log with all others; return notes, and the delay of the sensor."""
-    if len([c for c in channels if c.name != "gravity"]) < 2:
+    if len(channels) < 2:
         return [], None
     delay = _delay_of(recording, channels, limits)
     late = abs(delay.nearest(0.0)) if delay else 0.0
     if late > limits.late_s:  # a clock that drifts: it adds nearly the same delay throughout the recording
         limits = replace(limits, late_s=late + limits.late_s)
-    notes = []
-    for gross, note in filter(None, map(ChannelComparison(recording, channels, limits).find, channels)):
+    notes, comparison = [], ChannelComparison(recording, channels, limits)
+    for gross, note in filter(None, (comparison.find(channel, by_gravity) for channel in channels)):
         if gross:
             hint = "correct or leave out these rows of the table's log, or record again"
             raise refusal(recording, "reference_contradiction", note.detail, hint)
@@ -455,7 +474,7 @@ def _check_directions(
 
 def _delay_of(recording: Recording, channels: Sequence[Channel], limits: ChannelLimits) -> Delay | None:
     """Return the delay of the sensor against the table's log; refuse a delay that no effect explains."""
-    first, *others = (c for c in channels if c.name != "gravity")
+    first, *others = channels
     found = None
     for other in others:
         of_sensor = other.name == "gyroscope"

@@ -211,13 +211,13 @@ def _gear(recording: Recording, allowed: float) -> tuple[float, float] | None:
     angle, rate, force = recording.table_angle, recording.logged_rate, recording.accelerometer
     if recording.role != "gyroscope":  # in a turn of minutes, a bias that follows the temperature has the same signal
         return None
-    if angle is None or rate is None or force is None or gravity_turned(recording) is None:
+    if angle is None or rate is None or force is None:
         return None
     keep = recording.valid
     if np.count_nonzero(keep) < FEWEST_OF_A_GEAR or float(np.ptp(angle[keep])) < WHOLE_TURN_DEG:
         return None
     axis, w, t = axis_index(recording), np.radians(rate[keep]), recording.time[keep]
-    y = force[keep].T[[(axis + 1) % 3, (axis + 2) % 3]]
+    y = force.compress(keep, axis=0).T[[(axis + 1) % 3, (axis + 2) % 3]]
     a = logged = np.radians(angle[keep] - float(np.mean(angle[keep])))
     slope, late = np.gradient(w, t), (t - t[0]) / (t[-1] - t[0])
     for iteration in range(GEAR_ITERATIONS):
@@ -232,11 +232,12 @@ def _gear(recording: Recording, allowed: float) -> tuple[float, float] | None:
         both = np.stack([a * (sine * c - cosine * s), y], axis=2)
         both -= Q @ (Q.T @ both)
         d, e = np.moveaxis(both - own @ (np.swapaxes(own, 1, 2) @ both), 2, 0)
-        information = float(np.sum(d * d))
+        information = max(float(np.sum(d * d)), float(np.finfo(float).tiny))  # 0: gravity stays
         step = float(np.sum(d * e)) / information
         white = float(np.sqrt(max(np.mean(e * e) - step * step * information / e.size, 0.0) / information))
         small = np.mean(e * e) < LINEAR_G**2
-        if iteration == 0 and small and abs(step) <= SURELY * (allowed + SIGNIFICANT_UNCERTAINTIES * white):
+        surely = small and abs(step) <= SURELY * (allowed + SIGNIFICANT_UNCERTAINTIES * white)
+        if (iteration == 0 and surely) or gravity_turned(recording) is None:
             return None
         a = a * (1.0 + step)
         if abs(step) < CONVERGED:
