@@ -228,10 +228,9 @@ class TurnFit:
 def fit_turn(recording: Recording) -> TurnFit:
     """Return c, p, q and k of a turn whose log has the table's angle, its rate, or both."""
     angle, rate = recording.table_angle, recording.table_rate
-    slope = None if angle is None or recording.samples < 2 else np.gradient(angle, recording.time)
-    used = slope if rate is None else rate
+    used = recording.logged_rate
     gain = _gain(recording, used)
-    if gain is not None and rate is not None and slope is not None and float(rate @ slope) < 0.0:
+    if gain is not None and rate is not None and angle is not None and float(rate[1:] @ np.diff(angle)) < 0.0:
         gain = -gain  # the rate counts against the angle: here the angle counts; the check of the reference refuses it
     if angle is None or recording.accelerometer is None:
         missing = "angle of the table" if angle is None else "accelerometer"
@@ -239,13 +238,13 @@ def fit_turn(recording: Recording) -> TurnFit:
     keep = recording.valid
     A = np.radians(angle[keep])
     arc = float(np.ptp(angle)) if len(angle) else 0.0
-    mean_rate = 0.0 if slope is None else float(np.mean(slope))
+    mean_rate = float((angle[-1] - angle[0]) / np.ptp(recording.time)) if recording.samples > 1 else 0.0
     terms = [np.ones_like(A)]
     if used is not None and np.any(used[keep]):
         r = used[keep] / np.max(np.abs(used))
         terms += [r, np.abs(r), r * r]
     # Normal equations of all terms; the constant and the terms of the rate are eliminated.
-    rows, m = np.stack([*terms, np.cos(A), np.sin(A), *recording.accelerometer[keep].T]), len(terms)
+    rows, m = np.stack([*terms, np.cos(A), np.sin(A), *recording.accelerometer.compress(keep, axis=0).T]), len(terms)
     products = rows @ rows.T
     powers, vectors = np.linalg.eigh(products[:m, :m])
     vectors = vectors[:, powers > SMALLEST_SHARE * powers[-1]]
@@ -270,7 +269,7 @@ def _gain(recording: Recording, rate: Values | None) -> Values | None:
     if recording.gyroscope is None or rate is None:
         return None
     keep = recording.valid
-    rate, gyro = rate[keep], recording.gyroscope[keep]
+    rate, gyro = rate[keep], recording.gyroscope.compress(keep, axis=0)
     largest, n = float(np.max(np.abs(rate), initial=0.0)), max(len(rate), 1)
     change = rate - np.sum(rate) / n
     changing = float(np.sqrt(change @ change / n)) > CHANGING * largest

@@ -282,6 +282,7 @@ def _placed(recordings: list[Recording], table: Table) -> list[Recording]:
 
 
 def _check_shared_rows(recordings: Sequence[Recording]) -> None:
+    recordings = [r for r in recordings if r.accelerometer is not None or r.gyroscope is not None]
     decimals = [_decimals(r) for r in recordings]
     for coarser in sorted({tuple(map(min, x, y)) for x, y in itertools.combinations(decimals, 2)}, reverse=True):
         _check_at(recordings, coarser)
@@ -304,37 +305,36 @@ def _decimals(recording: Recording) -> tuple[int, ...]:
 
 def _check_at(recordings: Sequence[Recording], decimals: Sequence[int]) -> None:
     """Refuse two recordings with the same samples, rounded to the decimals of each sensor."""
-    keys = [_keys(r, decimals) for r in recordings]
-    value = np.concatenate(keys)
+    value, samples = _keys(recordings, decimals), [r.samples for r in recordings]
     known = np.sort(value)  # faster than the order of equal rows
     if np.count_nonzero(known[1:] == known[:-1]) < MIN_STEP_ROWS - 1:
         return
-    owner = np.repeat(np.arange(len(keys)), [len(k) for k in keys])
-    row = np.concatenate([np.arange(len(k)) for k in keys])
+    owner = np.repeat(np.arange(len(samples)), samples)
+    row = np.concatenate([np.arange(n) for n in samples])
     order = np.argsort(value, kind="stable")  # equal rows next to each other, in the order of recordings
     value, owner, row = value[order], owner[order], row[order]
     within = (value[1:] == value[:-1]) & (owner[1:] == owner[:-1])
     single = ~(np.append(within, False) | np.append(False, within))  # rows that occur once in their recording
     value, owner, row = value[single], owner[single], row[single]
-    for step in range(1, len(keys)):  # a row may be in several recordings: a pair of it is up to n - 1 places apart
+    for step in range(1, len(samples)):  # a row may be in several recordings: a pair of it is up to n - 1 places apart
         twin = np.flatnonzero(value[step:] == value[:-step])
         if twin.size < MIN_STEP_ROWS:
             break
-        pairs = owner[twin] * len(keys) + owner[twin + step]
+        pairs = owner[twin] * len(samples) + owner[twin + step]
         for pair in np.unique(pairs):
             chosen = twin[pairs == pair]
-            one, two = divmod(int(pair), len(keys))
+            one, two = divmod(int(pair), len(samples))
             _check_pair(recordings[one], recordings[two], row[chosen], row[chosen + step])
 
 
-def _keys(recording: Recording, decimals: Sequence[int]) -> NDArray[np.uint64]:
-    """Return a hash of each row's readings: (n,) array; empty without readings."""
-    pairs = zip(SENSORS, decimals, strict=True)
-    columns = [c for s, d in pairs if (r := recording.reading(s)) is not None for c in np.round(r, d).T]
-    key = np.zeros(recording.samples if columns else 0, np.uint64)
-    for column in columns:
-        key = (key ^ (column + 0.0).view(np.uint64)) * MIX  # + 0.0: no negative zero
-        key ^= key >> np.uint64(29)
+def _keys(recordings: Sequence[Recording], decimals: Sequence[int]) -> NDArray[np.uint64]:
+    """Return a hash of the readings in each row of all recordings, with zeros for those of an absent sensor."""
+    key: NDArray[np.uint64] = np.zeros(1, np.uint64)
+    for sensor, digits in zip(SENSORS, decimals, strict=True):
+        readings = [np.zeros((r.samples, 3)) if (v := r.reading(sensor)) is None else v for r in recordings]
+        for column in np.round(np.concatenate(readings), digits).T:
+            key = (key ^ (column + 0.0).view(np.uint64)) * MIX  # + 0.0: no negative zero
+            key ^= key >> np.uint64(29)
     return key
 
 

@@ -210,7 +210,7 @@ def ratio_quantiles(one: Values, other: Values, cut: int, least: float, *shares:
     size = np.abs(other)
     largest = largest_but(size, cut)
     used = size > least * largest
-    weight, ratio = np.minimum(size[used], largest), np.atleast_2d(one[used].T) / other[used]
+    weight, ratio = np.minimum(size[used], largest), np.atleast_2d(one.compress(used, axis=0).T) / other[used]
     order = np.argsort(ratio, axis=1)
     total = np.cumsum(weight[order], axis=1) / weight.sum()
     rows = zip(ratio, order, total, strict=True)
