@@ -342,7 +342,7 @@ def _blocks_of(rests: Sequence[RestReadings], shortest: int) -> _RestBlocks:
     clock = np.array([r.clock for r in rests])[rest]
     first = np.cumsum(counts) - counts
     mean = np.add.reduceat(values, first) / counts[:, None]
-    scatter = np.maximum(np.sum(values * values, axis=0) - np.sum(counts[:, None] * mean * mean, axis=0), 0.0)
+    scatter = np.maximum(np.einsum("nc,nc->c", values, values) - counts @ (mean * mean), 0.0)
     length = (time[first + counts - 1] - time[first]) * counts / np.maximum(counts - 1, 1)
     return _RestBlocks(time[first], length, counts, mean, rest, clock, pieces[rest] > 1, scatter)
 
