@@ -67,7 +67,7 @@ def fit(task: StageInput, *, details: bool = True) -> SensorCalibration:
     sensor, recordings, settings, prior = task.sensor, task.recordings, task.settings, task.prior
     parts = [_select(sensor, part) for part in parts_of(recordings.filtered, sensor, settings.table, NAME)]
     readings = np.concatenate([part.reading(sensor) for part in parts])
-    truths = np.concatenate([_reference(sensor, part)[part.keep] for part in parts])
+    truths = np.concatenate([_reference(sensor, part).compress(part.keep, axis=0) for part in parts])
     if not truths.any():
         raise NotObservableError(f"{sensor}: the table never moved in these recordings; {ADVICE[sensor]}")
     rows, blocks = rows_of_parts(parts)

@@ -64,7 +64,7 @@ class TurnPart:
         """Return the readings that are used: (k, 3) array."""
         reading = self.recording.reading(sensor)
         assert reading is not None  # noqa: S101
-        return reading[self.keep]
+        return reading.compress(self.keep, axis=0)
 
 
 def used_motions(parts: Sequence[TurnPart]) -> list[Motion]:
@@ -232,7 +232,7 @@ class RowGroups:
         size = self.count.astype(int)
         if np.all(size < 2):
             return self
-        kept = reading[self.kept]
+        kept = reading.take(self.kept, axis=0)
         inside = np.ones(len(kept) - 1, bool)
         inside[self.first[1:] - 1] = False
         white = median(np.diff(kept, axis=0)[inside] ** 2) / MEDIAN_OF_DIFFERENCES
@@ -248,7 +248,7 @@ class RowGroups:
 
     def means(self, values: Values) -> Values:
         """Return the group means of (n, ...) values: (m, ...) array."""
-        kept = values if len(self.kept) == len(values) else values[self.kept]
+        kept = values if len(self.kept) == len(values) else values.take(self.kept, axis=0)
         if len(self.first) == len(kept):
             return kept
         shape = (-1,) + (1,) * (values.ndim - 1)
@@ -351,7 +351,7 @@ def _grouped(motion: Motion, kept: Index, together: bool) -> RowGroups:  # noqa:
     alike = (still[1:] == still[:-1]) & (sense[1:] == sense[:-1]) & (np.diff(kept) == 1) & together
     run = np.concatenate([[0], np.cumsum(~alike)])
     begin = np.flatnonzero(np.concatenate([[True], ~alike]))[run]
-    speed = np.where(still, 0.0, length(motion.angular_rate[kept]))
+    speed = np.where(still, 0.0, length(motion.angular_rate.take(kept, axis=0)))
     turned = np.cumsum(speed * np.diff(time, append=time[-1]))  # at the end of the interval after each sample
     step = max(ROW_RATE_SHARE * float(speed.max()), RATE_AT_REST_DPS)
     for deg, times in ((ROW_DEG, 1.0), (LONG_ROW_DEG, LONG_ROW_RATES)):

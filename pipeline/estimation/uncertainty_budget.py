@@ -111,10 +111,10 @@ def limited_effects(sensor: str, known: Collection[str], sheet: DataSheet) -> It
     for name, this in catalogue().items():
         if name in within or sensor not in this.sensors or sensor in this.unseen or this.owner not in OWNERS:
             continue
-        if name not in limits or this.moves or this.of_turns or not np.all(np.isfinite(limits[name])):
+        if name not in limits or this.moves or this.of_turns or not np.isfinite(limits[name]).all():
             continue
-        linear = np.array([p.name not in this.nonlinear for p in this.parameters(sensor)])
-        yield from ((this, start, np.where(linear, limits[name], 0.0)) for start in this.starts(sensor))
+        of_linear = limits[name] * [p.name not in this.nonlinear for p in this.parameters(sensor)]
+        yield from ((this, start, of_linear) for start in this.starts(sensor))
 
 
 def keep_larger(found: dict[str, Values], name: str, change: Values) -> None:
@@ -130,6 +130,7 @@ def changes_on_table(
     found: dict[str, Values] = {}
     motions, fit = _in_blocks(centred(reference.motions), fit)
     sensor, K = reference.sensor, reference.K
+    gains = np.stack([J[BASE] @ A for J, A in zip(fit.derivative, fit.weights, strict=True)])
     joined = joined_motions([motion.changed(direction=turning_direction(motion)) for motion in motions])
     for this, start, limits in limited_effects(sensor, modelled, data_sheet):
         if not all(this.available(motion) for motion in motions):
@@ -139,13 +140,8 @@ def changes_on_table(
             columns = columns_of_samples(term, sensor, joined, K)
         else:
             columns = np.concatenate([term.regressors(sensor, motion, K) for motion in motions])
-        if columns.ndim == 3:
-            fitted = [A @ z for A, z in zip(fit.weights, columns.transpose(1, 0, 2), strict=True)]
-        else:
-            alike = fit.weights[0] is fit.weights[1] is fit.weights[2]
-            fitted = [fit.weights[0] @ columns] * 3 if alike else [A @ columns for A in fit.weights]
-        each = [J[BASE] @ change for J, change in zip(fit.derivative, fitted, strict=True)]
-        change = sum(each) if term.layout() == Layout.SHARED else np.concatenate(each, axis=1)
+        each = gains @ (columns if columns.ndim == 2 else columns.transpose(1, 0, 2))  # of each channel
+        change = each.sum(axis=0) if term.layout() == Layout.SHARED else np.concatenate(each, axis=1)
         full = np.zeros((BASE_COUNT, len(limits)))
         full[:, : change.shape[1]] = change
         keep_larger(found, this.name, full * limits)

@@ -402,7 +402,8 @@ class Motion:
         """Return the motion at some samples (a mask or integers), without the trajectory between samples."""
         if index.dtype == bool and index.all():  # without a copy
             return self.changed(at_offset=None, at_lag=None)
-        return self.mapped(lambda values: np.asarray(values[index]), at_offset=None, at_lag=None)
+        rows = np.flatnonzero(index) if index.dtype == bool else index  # ``take`` needs a quarter of the time of a mask
+        return self.mapped(lambda values: values.take(rows, axis=0), at_offset=None, at_lag=None)
 
 
 def motion_at_rest(time: NDArray[np.float64]) -> Motion:

@@ -140,7 +140,7 @@ def step_of(changes: Values, rounding: float, *, printed: bool = False) -> float
     ``changes``: absolute values, (n,). ``rounding``: the largest change that is a rounding error. ``printed``: whether
     the step may be known by a few decimals only, so that its error grows with the multiple.
     """
-    distinct = np.diff(np.unique(changes), prepend=0.0)
+    distinct = np.diff(np.sort(changes), prepend=0.0)
     larger = distinct[distinct > rounding]
     if len(larger) == 0:
         return 0.0

@@ -62,7 +62,7 @@ BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
     "band_pass": "bandpass",
     "band_stop": "bandstop",
 }
-KERNEL_BLOCK = 256  # cells at once: their kernels stay in the processor's cache
+KERNEL_BLOCK = 128  # cells at once: their kernels stay in the processor's cache
 NARROWEST_S = 0.5  # below the thermal time constant of a package, which is seconds
 RELATIVE_ROUNDING = 1e-12  # relative: some thousand roundings of a double
 MIN_SWING_DEGC = 1.0  # twice the step of a coarse thermometer, 0.5 degC
@@ -342,7 +342,8 @@ def _local_line(time: Values, temperature: Values, bandwidth: float) -> Values:
         near = slice(*np.searchsorted(t, [t[block][0] - 5 * bandwidth, t[block][-1] + 5 * bandwidth]))
         x, n, v = (t[near] - t[block][0]) / bandwidth, count[near], value[near] - value[start]
         middle = (t[block] - t[block][0]) / bandwidth
-        weights = np.exp(-0.5 * (x - middle[:, None]) ** 2)
+        weights = x - middle[:, None]
+        np.exp(np.multiply(weights, -0.5 * weights, out=weights), out=weights)
         s0, s1, s2, r0, r1 = (weights @ np.stack([n, n * x, n * x * x, n * v, n * x * v], 1)).T
         s1, s2, r1 = s1 - middle * s0, s2 - middle * (2.0 * s1 - middle * s0), r1 - middle * r0  # about the cell itself
         determinant = s0 * s2 - s1 * s1
