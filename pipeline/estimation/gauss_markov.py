@@ -307,32 +307,34 @@ class GaussMarkov:
     def whitened(self, columns: Values) -> Values:
         """Return ``R A`` with ``R^T R = C^-1`` of (m, p) columns, blocks last and in order: (g, p, m) array.
 
-        In ``z_k = own_k a_k - past_k a_(k-1) - carried_k z_(k-1)`` each factor is of one setting and block.
+        In ``z_k = own_k a_k + past_k a_(k-1) - carried_k z_(k-1)`` each factor is of one setting and block.
         """
         # blocks first, then settings and columns: numpy is fast if the last axis is long and contiguous
         axis = 2 if columns.shape[1] > len(self._half) else 1  # of the columns
-        own, past, carried = (np.expand_dims(v, axis) for v in self._factors)
-        ordered = np.expand_dims(columns[self._order], 3 - axis)
-        z = own * ordered
-        z[1:] -= past * ordered[:-1]
+        both, carried = self._factors
+        pairs = np.zeros((len(columns), 2, columns.shape[1]))  # of each block, with the one before it
+        pairs[:, 0] = columns[self._order]
+        pairs[1:, 1] = pairs[:-1, 0]
+        z = both.transpose(0, 2, 1) @ pairs if axis == 2 else pairs.transpose(0, 2, 1) @ both
         rows, part = [*z.reshape(len(z), -1)], np.empty(z[0].size)
-        factors = np.broadcast_to(carried, z[1:].shape).reshape(len(carried), -1)  # faster than to broadcast each
-        for before, row, factor in zip(rows, rows[1:], factors, strict=False):
+        factors = np.broadcast_to(np.expand_dims(carried, axis), z[1:].shape)  # faster than to broadcast each
+        for before, row, factor in zip(rows, rows[1:], factors.reshape(len(carried), -1), strict=False):
             np.subtract(row, np.multiply(factor, before, part), row)
         return z.transpose(3 - axis, axis, 0)
 
     @cached_property
-    def _factors(self) -> tuple[Values, Values, Values]:
-        """The factors of ``whitened``: (m, g) of a block, and (m - 1, g) of the one before it and of its result."""
+    def _factors(self) -> tuple[Values, Values]:
+        """The factors of ``whitened``: (m, 2, g) of a block and the one before it, (m - 1, g) of the last result."""
         root = np.sqrt(self._d.reshape(self._half.shape))
         below = np.append(self._e, 0.0).reshape(root.shape)[:, :-1]  # subdiagonal of L; T = L D L^T
-        past = self._phi / (self._half[:, :-1] * root[:, 1:])
-        own, carried = 1.0 / (self._half * root), below * root[:, :-1] / root[:, 1:]
-        return np.ascontiguousarray(own.T), np.ascontiguousarray(past.T), np.ascontiguousarray(carried.T)
+        both = np.zeros((len(root.T), 2, len(root)))
+        both[:, 0] = 1.0 / (self._half * root).T
+        both[1:, 1] = -(self._phi / (self._half[:, :-1] * root[:, 1:])).T
+        return both, np.ascontiguousarray((below * root[:, :-1] / root[:, 1:]).T)
 
     def squares(self, columns: Values) -> Values:
         """Return ``a^T C^-1 a`` of each of (m, p) columns: (g, p) array, without keeping what ``whitened`` returns."""
-        own, past, carried = (v[:, :, None] for v in self._factors)
+        own, past, carried = (v[..., None] for v in (*self._factors[0].swapaxes(0, 1), self._factors[1]))
         found: Values = np.empty((len(self._half), columns.shape[1]))
         size = max(1, CACHED // len(found))
         for at in (slice(first, first + size) for first in range(0, columns.shape[1], size)):
@@ -342,7 +344,7 @@ class GaussMarkov:
             for k in range(1, len(ordered)):
                 np.multiply(carried[k - 1], z, out=z)
                 np.subtract(np.multiply(own[k], ordered[k], out=part), z, out=z)
-                np.subtract(z, np.multiply(past[k - 1], ordered[k - 1], out=part), out=z)
+                np.add(z, np.multiply(past[k], ordered[k - 1], out=part), out=z)
                 np.add(total, np.multiply(z, z, out=part), out=total)
             found[:, at] = total
         return found
