@@ -260,8 +260,8 @@ class RowGroups:
 
     def motion(self, motion: Motion) -> Motion:
         """Return the motion at the rows."""
-        resting, known = motion.still[self.kept[self.first]], self.all(motion.reference_valid)
-        found = motion.mapped(self.means, still=resting, reference_valid=known)
+        known = (lambda: self.all(motion.reference_valid)) if motion.has("reference_valid") else None
+        found = motion.mapped(self.means, still=motion.still[self.kept[self.first]], reference_valid=known)
         logged, long = motion.at_offset, self.count.max(initial=0.0) > ALL_SAMPLES
         step = float(np.ptp(motion.time)) / max(len(motion.time) - 1, 1)
         if motion.axis is not None and logged and long and step <= FINEST_STEP_S:

@@ -359,7 +359,7 @@ class EncoderTrajectory:
         return angle, rate, acceleration
 
     def angle_at(self, time: Values) -> Values:
-        """Return the angle (deg) at any times: (n,) array."""
+        """Return the angle (deg) at any times: array of their shape."""
         k = self._interval(time)
         x = time - self.time[k]
         angle, smooth = self._angle(k, x, np.maximum(x - self._bend[k], 0.0)), ~self.explained[k]
@@ -443,7 +443,7 @@ class EncoderTrajectory:
     def _circle(self, time: Values, lag: float) -> tuple[Values, Values]:
         """Return cosine and sine of the angle behind a lag: (n,) arrays."""
         nodes, weights = (NODES, WEIGHTS) if lag > 0.0 else (np.zeros(1), np.ones(1))
-        turns = np.radians([self.angle_at(time - lag * node) for node in nodes])
+        turns = np.radians(self.angle_at(time - lag * nodes[:, None]))
         return weights @ np.cos(turns), weights @ np.sin(turns)
 
     def path(
