@@ -281,7 +281,8 @@ def without(products: Values, index: Index) -> Values:
     """
     if len(index) == 0:
         return products
-    rest = products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
+    rest = products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
+    np.subtract(products, rest, out=rest)
     new = np.einsum("tpp->tp", rest) > MIN_LEFT_SQUARE_SHARE * np.einsum("tpp->tp", products)
     new[:, -1] = True
     setting, column = np.nonzero(~new)
