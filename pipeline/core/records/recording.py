@@ -379,7 +379,9 @@ class Motion:
 
     def changed(self, **fields: Any) -> Motion:  # noqa: ANN401  (of the dataclass)
         """Return the motion with other fields; unlike ``replace``, it computes no deferred one."""
-        return Motion(**{**vars(self), **fields})
+        found = object.__new__(Motion)  # in a third of the time of the initializer
+        vars(found).update(vars(self), **fields)
+        return found
 
     def mapped(self, change: Callable[[NDArray[Any]], NDArray[Any]], **fields: Any) -> Motion:  # noqa: ANN401
         """Return the motion with every array changed, those of ``DEFERRED`` later, and with other fields."""
