@@ -342,8 +342,9 @@ def completed(selection: Selection, hidden: Callable[[Selection], Collection[str
     shown, the evidence of the whole set is enough. A slow effect joins others only: alone, it was drift in 2 of 864
     sensors without one, both with a random walk of the bias.
     """
-    if not selection.names and not any(s.delta_bic > 0.0 and s.admissible for s in selection.alone.values()):
-        return selection
+    scores = [s for s in selection.alone.values() if s.delta_bic > 0.0 and s.admissible]
+    if not selection.names and not any(s.plausible or effect(s.name).nonlinear for s in scores):
+        return selection  # none could be the first one; a nonlinear one may be plausible at its own optimum
     curves = curves_of(selection) if selection.names else ()
     names, probability = posterior(selection, hidden(selection), curves).sets[0]
     more = [name for name in names if name not in selection.names]

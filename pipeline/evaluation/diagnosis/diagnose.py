@@ -217,8 +217,8 @@ def diagnose(
     except NotObservableError as reason:
         return judge(None, _not_enough_data(sensor, configured, reason.message, procedure.NEEDED_RECORDING))[0]
     diagnosis, unknown = judge(findings, diagnosis_of(findings, case))
-    if unknown and findings.search:
-        findings = findings.search() or findings
+    if unknown and findings.search and (found := findings.search()):
+        findings = found
         diagnosis, _ = judge(findings, diagnosis_of(findings, case))
     if findings.deeper and (full or diagnosis.verdict != Verdict.NOTHING_MISSING):
         diagnosis = replace(diagnosis, further=findings.deeper())

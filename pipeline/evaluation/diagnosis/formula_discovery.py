@@ -241,8 +241,7 @@ class Forms:
 
     def ranked(self) -> list[ScoredForm]:
         """Return the best form of each name, best score first."""
-        spans, refined = self._spans, self._coarse()
-        of_coarse = dict(self._columns)
+        spans, refined, of_coarse = self._spans, self._coarse(), dict(self._columns)
         best = _best_of_each(map(ScoredForm, refined, self.gains(refined)))
         for spacing in SCAN_REFINEMENTS:
             around = ((each.form.factor, each.form.modulator) for each in best if each.form.factor.signal in spans)
@@ -251,12 +250,12 @@ class Forms:
         self._columns = of_coarse  # those of the finer constants would have as much memory again
         return _best_of_each([*best, *self._polynomials()])
 
-    def may_leave(self, mean_square: float) -> bool:
+    def may_leave(self, mean_square: float, times: float = MAX_FORMULA_TERMS) -> bool:
         """Return whether a formula may leave so small a mean square of the residual.
 
         It may not if terms that explain no more together than apart leave more: in addition to given terms, all that
-        ``MAX_FORMULA_TERMS`` explain is at most so many times what the best one does, and what the given ones explain
-        with finer constants. White noise leaves least. A term is a factor with any modulator, a band, or a polynomial.
+        others explain is at most so many ``times`` what the best one does, and what the given ones explain with finer
+        constants. White noise leaves least. A term is a factor with any modulator, a band, or a polynomial.
         """
         thin, (factors, modulators), every = copy(self), self._factors, -(-len(self.scan.weight) // SCREENED_ROWS)
         vars(thin).update(_columns={}, _signals=[{k: v[::every] for k, v in each.items()} for each in self._signals])
@@ -276,7 +275,7 @@ class Forms:
             of_bands = np.sum([axis.explained(bands, ones) for axis, *_ in axes], axis=0)
             polynomials = np.sum([axis.explained_together(powers) for axis, *_, powers in axes], axis=0)
             most = max(products.max(), of_bands.max(), polynomials.max())
-            if excess - explained > MAX_FORMULA_TERMS * most + BETWEEN_PLACES * explained:
+            if excess - explained > times * most + BETWEEN_PLACES * explained:
                 return False
             f, m = np.unravel_index(products.argmax(), products.shape)
             columns = slice(first[f], first[f] + len(factors[f].texts))
@@ -374,17 +373,22 @@ def _best_of_each(scored: Iterable[ScoredForm]) -> list[ScoredForm]:
     return sorted(best.values(), key=lambda each: -each.score)
 
 
-def search(grammar: Forms) -> tuple[list[ScoredForm], list[ScoredForm]]:
-    """Return the terms of the best form, none if none is clear, and all forms of one term, best first."""
+def search(grammar: Forms, far: float) -> tuple[list[ScoredForm], list[ScoredForm]]:
+    """Return the terms of the best form, none if none is clear, and all forms of one term, best first.
+
+    ``far``: mean square of the residual; if not 0, no term is returned where further ones cannot leave so little.
+    """
     terms: list[ScoredForm] = []
-    first = ranked = grammar.ranked()
-    while ranked and ranked[0].clear:
-        if terms and ranked[0].gain.delta_bic <= MIN_FURTHER_GAIN_SHARE * terms[0].gain.delta_bic:
-            break
+    first = ranked = [] if far and not grammar.may_leave(far) else grammar.ranked()
+    least = 0.0
+    while ranked and ranked[0].clear and ranked[0].gain.delta_bic > least:
         terms.append(ranked[0])
+        least = MIN_FURTHER_GAIN_SHARE * terms[0].gain.delta_bic
         if len(terms) == MAX_FORMULA_TERMS:
             break
         grammar.explain([text for term in terms for text in term.form.formulas])
+        if far and not grammar.may_leave(far, (1.0 + BETWEEN_PLACES) * (MAX_FORMULA_TERMS - len(terms))):
+            return [], first
         ranked = [each for each in grammar.ranked() if not any(each.form.refines(term.form) for term in terms)]
     return terms, first
 
@@ -424,10 +428,8 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
     tried: list[tuple[Sequence[str], Sequence[str]]] = []
     for context in [selection, alone] if selection.names else [selection]:
         grammar = grammar.at(context) if grammar else Forms(context)
-        far = 0.0 < FAR_ABOVE * floor < context.fit.residual_rms
-        if far and not grammar.may_leave((FAR_ABOVE * floor) ** 2):
-            continue
-        terms, ranked = search(grammar)
+        far = FAR_ABOVE * floor if FAR_ABOVE * floor < context.fit.residual_rms else 0.0
+        terms, ranked = search(grammar, far**2)
         if not terms:
             continue
         found, first = _fitted_form(context, terms), terms[0]
@@ -437,8 +439,7 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
         definition = suggested_effect(entry.covariate, found, case.sensor, catalogue())
         form = effect_from(definition, "a first guess")
         added = [*context.fit.terms, EffectColumns(form, np.zeros(len(form.parameters(case.sensor))))]
-        start = context.observations, added, context.start, context.settings
-        if far and fit_terms(*start).residual_rms > FAR_ABOVE * floor:
+        if far and fit_terms(context.observations, added, context.start, context.settings).residual_rms > far:
             continue
         tried.append((found.formulas, found.axes))
         names = [*case.configured, form.name]
@@ -474,8 +475,7 @@ def _fitted_form(selection: Selection, terms: Sequence[ScoredForm]) -> FittedFor
     projected = ProjectedCurves(scan, scan.values(forms.columns_of(texts, sensor)))
     coefficients = projected.coefficients(range(len(texts)), terms[-1].gain.setting)
     axes = sorted({axis for term in terms for axis in term.gain.axes})
-    edges = np.cumsum([len(term.form.formulas) for term in terms])[:-1]
-    of_terms = np.split(coefficients, edges, axis=1)
+    of_terms = np.split(coefficients, np.cumsum([len(term.form.formulas) for term in terms])[:-1], axis=1)
     sizes = [_sizes_of(t.form, c, selection.observations) for t, c in zip(terms, of_terms, strict=True)]
     words = [_described(t.form, size, t.gain.axes, sensor) for t, size in zip(terms, sizes, strict=True)]
     return FittedForm(
