@@ -125,5 +125,5 @@ def test_a_bin_holds_as_much_wander_as_its_cells_of_time_have_in_common() -> Non
     np.testing.assert_allclose(bins.weight, [3.0, 1.0, 1.0])
     together = np.exp(-100.0 / 200.0)
     expected = [(3.0 + 2.0 * together) / 9.0, 1.0, 1.0]  # the third recording has a clock of its own
-    np.testing.assert_allclose(bins.bias_of_means(blocks, 200.0), expected)
+    np.testing.assert_allclose(bins.bias_of_means(blocks, blocks.covariance(200.0)), expected)
     np.testing.assert_allclose(bins.mean(np.array([1.0, 7.0, 3.0, 5.0, 5.0, 99.0])), [3.0, 7.0, 5.0])

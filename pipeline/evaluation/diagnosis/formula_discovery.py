@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.core.records import Dependence, FittedForm, RankedFormula, Values
+from pipeline.core.records import Dependence, FittedForm, Index, Mask, RankedFormula, Values
 from pipeline.estimation.design import Design, EffectColumns
 from pipeline.estimation.gates import MAX_MIN_DELTA_BIC, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import Setting
@@ -257,18 +257,8 @@ class Forms:
         others explain is at most so many ``times`` what the best one does, and what the given ones explain with finer
         constants. White noise leaves least. A term is a factor with any modulator, a band, or a polynomial.
         """
-        thin, (factors, modulators), every = copy(self), self._factors, -(-len(self.scan.weight) // SCREENED_ROWS)
-        vars(thin).update(_columns={}, _signals=[{k: v[::every] for k, v in each.items()} for each in self._signals])
-        rows = np.concatenate([np.arange(len(each["u"])) % every == 0 for each in self._signals])
-        root, first = np.sqrt(self.scan.weight[rows])[:, None], np.cumsum([0, *(len(f.texts) for f in factors[:-1])])
-        above = thin.column("speed") >= (self._spans["speed"].places() if "speed" in self._spans else np.zeros(1))
-        low, high = np.triu_indices(above.shape[1])
-        bands, ones, axes, explained = root * (above[:, low] & ~above[:, high]), np.ones_like(root), [], 0.0
-        for c in range(3):
-            F = np.stack([thin.on_axis(text, factor, c) for factor in factors for text in factor.texts]).T
-            G = np.stack([thin.on_axis(m.texts[0], m, c) if m else ones[:, 0] for m in modulators]).T
-            powers = F[:, : len(forms.POWERS) * (len(self._spans) + 1)].reshape(len(F), -1, len(forms.POWERS))
-            axes.append((self.scan.white(c, rows), F, root * G, root * powers.swapaxes(0, 1)))
+        rows, root, first, bands, terms = self._screened
+        axes, ones, explained = [(self.scan.white(c, rows), *terms[c]) for c in range(3)], np.ones_like(root), 0.0
         excess = sum(axis.residual @ axis.residual for axis, *_ in axes) - mean_square * 3.0 * np.sum(root**2)
         for _ in range(MAX_FORMULA_TERMS):
             products = np.add.reduceat(np.sum([axis.explained(F, G) for axis, F, G, _ in axes], axis=0), first)
@@ -278,9 +268,25 @@ class Forms:
             if excess - explained > times * most + BETWEEN_PLACES * explained:
                 return False
             f, m = np.unravel_index(products.argmax(), products.shape)
-            columns = slice(first[f], first[f] + len(factors[f].texts))
+            columns = slice(first[f], first[f] + len(self._factors[0][f].texts))
             explained += sum(axis.add(F[:, columns] * G[:, m, None]) for axis, F, G, _ in axes)
         return True
+
+    @cached_property
+    def _screened(self) -> tuple[Mask, Values, Index, Values, list[tuple[Values, Values, Values]]]:
+        """Return rows, their weights' roots, and the columns of the terms there; see ``may_leave``."""
+        thin, (factors, modulators), every = copy(self), self._factors, -(-len(self.scan.weight) // SCREENED_ROWS)
+        vars(thin).update(_columns={}, _signals=[{k: v[::every] for k, v in each.items()} for each in self._signals])
+        rows = np.concatenate([np.arange(len(each["u"])) % every == 0 for each in self._signals])
+        root, first = np.sqrt(self.scan.weight[rows])[:, None], np.cumsum([0, *(len(f.texts) for f in factors[:-1])])
+        above = thin.column("speed") >= (self._spans["speed"].places() if "speed" in self._spans else np.zeros(1))
+        (low, high), terms = np.triu_indices(above.shape[1]), []
+        for c in range(3):
+            F = np.stack([thin.on_axis(text, factor, c) for factor in factors for text in factor.texts]).T
+            G = np.stack([thin.on_axis(m.texts[0], m, c) if m else np.ones(len(F)) for m in modulators]).T
+            powers = F[:, : len(forms.POWERS) * (len(self._spans) + 1)].reshape(len(F), -1, len(forms.POWERS))
+            terms.append((F, root * G, root * powers.swapaxes(0, 1)))
+        return rows, root, first, root * (above[:, low] & ~above[:, high]), terms
 
     @cached_property
     def _factors(self) -> tuple[list[Factor], list[Factor | None]]:
@@ -313,10 +319,10 @@ class Forms:
             texts: np.stack([self.column(text, factor)[rows] for text in texts], axis=-1) if factor else np.ones(())
             for texts, factor in each.items()
         }
-        seen = {*_digests([self.column(text)[rows] for text in known])}
+        seen = {*forms.digests([self.column(text)[rows] for text in known])}
         values = [probed[form.factor.texts] * probed[form.modulator.texts if form.modulator else ()] for form in pairs]
         distinct = []
-        for form, digest in zip(pairs, _digests(values), strict=True):
+        for form, digest in zip(pairs, forms.digests(values), strict=True):
             if digest not in seen:
                 seen.add(digest)
                 distinct.append(form)
@@ -348,19 +354,6 @@ class Forms:
                 found.append(ScoredForm(Form(form), gains[best]))
                 first += len(texts)
         return found
-
-
-def _digests(values: Sequence[Values]) -> list[bytes]:
-    """Return the same bytes for forms whose values differ by a factor alone."""
-    found: dict[int, bytes] = {}
-    for number in {each.size for each in values}:
-        index = [k for k, each in enumerate(values) if each.size == number]
-        flat = np.stack([values[k].ravel() for k in index])
-        size = np.linalg.norm(flat, axis=1, keepdims=True)
-        first = np.take_along_axis(flat, np.argmax(np.abs(flat) > 1e-6 * size, axis=1)[:, None], axis=1)
-        scale = np.where(size > 0.0, size * np.sign(first), 1.0)
-        found |= zip(index, (row.tobytes() for row in np.round(flat / scale, 9)), strict=True)
-    return [found[k] for k in range(len(values))]
 
 
 def _best_of_each(scored: Iterable[ScoredForm]) -> list[ScoredForm]:

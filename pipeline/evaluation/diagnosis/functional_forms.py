@@ -12,7 +12,7 @@ scanned constants a, w, c count as parameters of the fit.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -220,6 +220,19 @@ class Form:
         above = unit_of(sensor) if exponents[unit_of(sensor)] == 1 else "1"
         below = [(f"({u})" if "/" in u else u) + (f"^{-e}" if e < -1 else "") for u, e in exponents.items() if e < 0]
         return "/".join([above, *below])
+
+
+def digests(values: Sequence[Values]) -> list[bytes]:
+    """Return the same bytes for forms whose values differ by a factor alone."""
+    found: dict[int, bytes] = {}
+    for number in {each.size for each in values}:
+        index = [k for k, each in enumerate(values) if each.size == number]
+        flat = np.stack([values[k].ravel() for k in index])
+        size = np.linalg.norm(flat, axis=1, keepdims=True)
+        first = np.take_along_axis(flat, np.argmax(np.abs(flat) > 1e-6 * size, axis=1)[:, None], axis=1)
+        scale = np.where(size > 0.0, size * np.sign(first), 1.0)
+        found |= zip(index, (row.tobytes() for row in np.round(flat / scale, 9)), strict=True)
+    return [found[k] for k in range(len(values))]
 
 
 def power(signal: str, p: int) -> Factor:

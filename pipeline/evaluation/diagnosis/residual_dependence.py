@@ -302,10 +302,9 @@ def plots(selection: Selection, unexplained: Sequence[Dependence], noise: Noise 
     ``parameter, unit, value, standard_uncertainty``. Panels of a suggested form also have ``curve_x, curve``.
     """
     shown = [entry for entry in unexplained if not entry.explained_by][:MAX_PLOTS]
-    regression = _Columns(selection) if shown else None
     return {
         "added_variable": _added_variable(_Columns(reported), reported) if reported.names else None,
-        "unexplained": [_unexplained(regression, selection, entry, noise) for entry in shown if regression],
+        "unexplained": _unexplained(selection, shown, noise) if shown else [],
     }
 
 
@@ -388,29 +387,34 @@ def _most_significant(term: EffectColumns, sensor: str, ratio: Values) -> list[i
     return [j if ratio[j] >= 0.0 else None for j in largest]
 
 
-def _unexplained(regression: _Columns, selection: Selection, entry: Dependence, noise: Noise | None) -> JSON:
-    """Return the plot of the residual against a covariate, with the curve of the suggested form."""
-    signal, forms = _signal_forms(selection, entry)
-    setting, values = WHITE_SETTING, _values(selection, signal)
+def _unexplained(selection: Selection, shown: Sequence[Dependence], noise: Noise | None) -> list[JSON]:
+    """Return the plots of the residual against covariates, with the curve of a suggested form."""
+    regression, setting, plots, blocks = _Columns(selection), WHITE_SETTING, [], selection.observations.blocks
     if noise is not None and np.any(noise.wander > 0):  # as expected: the fitted wander may contain the dependence
         setting = Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
+    covariance = blocks.covariance(setting.time)
     sigma = regression.white_noise(regression.residual - regression.wander(selection.fit.setting))
-    panels = []
-    for c, (form, coefficients) in enumerate(forms):
-        bins = Bins.of(values[:, c], regression.weight)
-        residual = regression.left_of(c, regression.residual[:, c] - form, setting) + form
-        variance = sigma[c] ** 2 / bins.weight
-        if noise is not None and noise.wander[c] > 0.0:
-            blocks = selection.observations.blocks
-            variance += noise.wander[c] ** 2 * bins.bias_of_means(blocks, noise.correlation_time)
-        panels.append({"axis": "xyz"[c]} | bins.document(residual, variance))
-        if entry.form and coefficients is not None:
-            grid = np.linspace(float(np.nanmin(values[:, c])), float(np.nanmax(values[:, c])), CURVE)
-            columns = [np.broadcast_to(parse(text)({signal: grid}), grid.shape) for text in entry.form.formulas]
-            curve = np.stack(columns, axis=1) @ np.asarray(coefficients, float)
-            panels[-1] |= {"curve_x": _rounded(grid), "curve": _rounded(curve)}
-    unit = unit_of(selection.observations.sensor)
-    return {"covariate": entry.covariate, "signal": signal, "unit": unit, "panels": panels}
+    left = [regression.left_of(c, regression.residual[:, c], setting) for c in range(3)]
+    for entry in shown:
+        signal, forms = _signal_forms(selection, entry)
+        values, panels = _values(selection, signal), []
+        for c, (form, coefficients) in enumerate(forms):
+            bins = Bins.of(values[:, c], regression.weight)
+            residual = left[c]
+            if coefficients is not None:
+                residual = regression.left_of(c, regression.residual[:, c] - form, setting) + form
+            variance = sigma[c] ** 2 / bins.weight
+            if noise is not None and noise.wander[c] > 0.0:
+                variance += noise.wander[c] ** 2 * bins.bias_of_means(blocks, covariance)
+            panels.append({"axis": "xyz"[c]} | bins.document(residual, variance))
+            if entry.form and coefficients is not None:
+                grid = np.linspace(float(np.nanmin(values[:, c])), float(np.nanmax(values[:, c])), CURVE)
+                columns = [np.broadcast_to(parse(text)({signal: grid}), grid.shape) for text in entry.form.formulas]
+                curve = np.stack(columns, axis=1) @ np.asarray(coefficients, float)
+                panels[-1] |= {"curve_x": _rounded(grid), "curve": _rounded(curve)}
+        unit = unit_of(selection.observations.sensor)
+        plots.append({"covariate": entry.covariate, "signal": signal, "unit": unit, "panels": panels})
+    return plots
 
 
 def _signal_forms(selection: Selection, entry: Dependence) -> tuple[str, list[tuple[Values, Sequence[float] | None]]]:
@@ -498,16 +502,16 @@ class Bins:
         sums = np.bincount(self.cell, self.row_weight * values, len(self.weight) + 1)
         return np.asarray(sums[: len(self.weight)] / self.weight)
 
-    def bias_of_means(self, blocks: Blocks, time: float) -> Values:
-        """Return the variance of the means by a Gauss-Markov bias of unit variance: (b,) array.
+    def bias_of_means(self, blocks: Blocks, covariance: Values) -> Values:
+        """Return the variance of the means by a bias: (b,) array.
 
-        ``a^T B a``, with the shares a of a bin in the blocks and the covariance B of a bias with this correlation time.
+        ``a^T B a``, with the shares a of a bin in the blocks and the ``covariance`` B of the bias in them.
         """
         bins, count = len(self.weight), len(blocks.first)
         index = self.cell * count + blocks.label(len(self.cell))
         sums = np.bincount(index, self.row_weight, (bins + 1) * count)
         share: Values = sums.reshape(bins + 1, count)[:bins] / self.weight[:, None]
-        return np.asarray(np.einsum("bi,bi->b", share @ blocks.covariance(time), share))
+        return np.asarray(np.einsum("bi,bi->b", share @ covariance, share))
 
     def document(self, values: Values, variance: Values) -> dict[str, list[float]]:
         """Return covariate, means of (n,) values and their standard errors as lists."""
