@@ -51,7 +51,9 @@ class Version(NamedTuple):
 class CandidateProblem:
     """Candidates in addition to a base, which is projected out, under t hypotheses about the noise."""
 
-    products: Values  # (t, p + 1, p + 1); of columns per limit of their parameters, and last the readings
+    # (t, p + 2, p + 2); of columns per limit of their parameters, of the readings, and of a column of zeros, which
+    # stands for the missing columns of smaller sets
+    products: Values
     prior: Values  # (t,); log pi(theta) - 1/2 log|C| - 1/2 log|X^T C^-1 X|
     within: float  # sum of squares that no column changes
     free: float  # nu
@@ -59,13 +61,6 @@ class CandidateProblem:
     limits: Mapping[str, Values]  # (k,), of the parameters of each effect; the unit of its columns
     excluded: Mapping[str, EffectSet] = field(default_factory=dict)  # effects that are never in a set with this one
     least: float = 0.0  # lower bound of sigma^2
-
-    @cached_property
-    def padded(self) -> Values:
-        """The products with a last column of zeros, which stands for the missing columns of smaller sets."""
-        padded: Values = np.zeros(np.add(self.products.shape, (0, 1, 1)))
-        padded[:, :-1, :-1] = self.products
-        return padded
 
     def rss(self, squares: Values) -> Values:
         """Return -nu/2 log RSS of sums of squares; if sigma has a lower bound, log L at its likeliest value."""
@@ -145,7 +140,8 @@ def linear_problem(  # noqa: PLR0917  (they are the problem)
         changes |= {j: change for j, change in zip(members, found, strict=True) if change is not None}
     for j in changes:
         unit[columns[j][2]] = 1.0
-    scaled = products * (unit[:, None] * unit)
+    scaled = np.zeros(np.add(products.shape, (0, 1, 1)))
+    np.multiply(products, unit[:, None] * unit, out=scaled[:, :ZEROS, :ZEROS])
     for at, change in ((columns[j][2], changes[j]) for j in sorted(changes)):
         scaled[:, :, at] = scaled[:, :, at] @ change
         scaled[:, at] = change.T @ scaled[:, at]
@@ -156,19 +152,20 @@ class Given:
     """A problem given s sets of effects, each at chosen versions and scales."""
 
     def __init__(self, problem: CandidateProblem, sets: Sequence[Mapping[str, Pick]]) -> None:
-        self.problem, products = problem, problem.padded
+        self.problem, products = problem, problem.products
         columns = [[problem.versions[name][v].columns for name, (v, _) in picks.items()] for picks in sets]
         shape = len(sets), max(sum(map(len, each)) for each in columns)
-        at, scale = np.full(shape, ZEROS), np.ones(shape)
+        self._at, scale = np.full(shape, ZEROS), np.ones(shape)
         for row, (picks, each) in enumerate(zip(sets, columns, strict=True)):
             if each:
                 used = slice(sum(map(len, each)))
-                at[row, used] = np.concatenate(each)
+                self._at[row, used] = np.concatenate(each)
                 scale[row, used] = np.repeat([LIMIT_SCALES[s] for _, s in picks.values()], [len(c) for c in each])
-        inner = products[:, at[:, :, None], at[:, None, :]] + scale[:, :, None] ** -2.0 * np.eye(shape[1])
+        inner = products[:, self._at[:, :, None], self._at[:, None, :]] + scale[:, :, None] ** -2.0 * np.eye(shape[1])
         L = cholesky(inner)
-        self._half = np.linalg.inv(L) @ products[:, at]  # its squares: the part of each column that the sets explain
-        self.squares = problem.products[:, None, -1, -1] - np.sum(self._half[..., READINGS] ** 2, axis=2)
+        self._inverse = np.linalg.inv(L)
+        self._readings = (self._inverse @ products[:, self._at, READINGS, None])[..., 0]
+        self.squares = products[:, None, READINGS, READINGS] - np.sum(self._readings**2, axis=2)
         logarithm = 2.0 * np.sum(np.log(np.einsum("tskk->tsk", L)), axis=2) + 2.0 * np.sum(np.log(scale), axis=1)
         chosen = [sum(SCALE_PRIOR[s] + problem.versions[n][v].log_weight for n, (v, s) in p.items()) for p in sets]
         self.level = problem.prior[:, None] - 0.5 * logarithm + np.array(chosen)
@@ -177,24 +174,26 @@ class Given:
         """Return log E of the sets under each hypothesis: (t, s) array."""
         return np.asarray(self.level + self.problem.rss(self.squares))
 
-    def blocks(self, names: Sequence[str]) -> list[CandidateBlock]:
-        """Return further effects, grouped by their number of columns."""
-        blocks, products = [], self.problem.padded
-        for index in by_size(len(self.problem.versions[name][0].columns) for name in names):
-            members = [names[j] for j in index]
-            each = [self.problem.versions[name] for name in members]
-            at = np.array([version.columns for versions in each for version in versions])
-            half = self._half[..., at].transpose(0, 1, 3, 4, 2)
-            inner = products[:, None, at[:, :, None], at[:, None, :]] - half @ half.swapaxes(3, 4)
-            cross = products[:, None, at, READINGS] - (half @ self._half[:, :, None, :, READINGS, None])[..., 0]
-            flat = inner.reshape(-1, *inner.shape[2:]), cross.reshape(-1, *cross.shape[2:]), self.squares.ravel()
-            gain, log_det = (values.reshape(-1, *inner.shape[:3]) for values in _explained(*flat))
-            squares = self.squares[:, :, None] - gain
-            weight = SCALE_PRIOR[:, None, None, None] + [v.log_weight for versions in each for v in versions]
-            score = self.problem.rss(squares) - 0.5 * log_det + self.level[:, :, None] + weight
-            owner = np.repeat(np.arange(len(each)), [len(versions) for versions in each])
-            blocks.append(CandidateBlock(members, owner, inner, cross, score, squares + self.problem.within))
-        return blocks
+    def further(self, names: Sequence[str]) -> Further:
+        """Return further effects in addition to each set, those with equal numbers of columns next to each other."""
+        versions, products = self.problem.versions, self.problem.products
+        groups = [[names[j] for j in index] for index in by_size(len(versions[name][0].columns) for name in names)]
+        ordered, inner, cross, gains, log_dets = [name for group in groups for name in group], [], [], [], []
+        for group in groups:
+            at = np.array([version.columns for name in group for version in versions[name]])
+            half = self._inverse @ products[:, self._at[:, :, None], at.ravel()]  # squares: what the sets explain
+            half = half.reshape(*half.shape[:3], *at.shape).transpose(0, 1, 3, 4, 2)
+            inner.append(products[:, None, at[:, :, None], at[:, None, :]] - half @ half.swapaxes(3, 4))
+            cross.append(products[:, None, at, READINGS] - (half @ self._readings[:, :, None, :, None])[..., 0])
+            flat = inner[-1].reshape(-1, *inner[-1].shape[2:]), cross[-1].reshape(-1, *cross[-1].shape[2:])
+            gain, log_det = _explained(*flat, self.squares.ravel())
+            gains.append(gain.reshape(-1, *inner[-1].shape[:3]))
+            log_dets.append(log_det.reshape(gains[-1].shape))
+        squares = self.squares[:, :, None] - np.concatenate(gains, axis=3)
+        weight = SCALE_PRIOR[:, None, None, None] + [v.log_weight for name in ordered for v in versions[name]]
+        score = self.problem.rss(squares) - 0.5 * np.concatenate(log_dets, axis=3) + self.level[:, :, None] + weight
+        owner = np.repeat(np.arange(len(ordered)), [len(versions[name]) for name in ordered])
+        return Further(ordered, owner, inner, cross, score, squares + self.problem.within)
 
 
 class Conditional(NamedTuple):
@@ -206,20 +205,20 @@ class Conditional(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CandidateBlock:
-    """Effects with equal numbers of columns, given s sets; their m versions follow each other."""
+class Further:
+    """Further effects given s sets; their m versions follow each other."""
 
     names: list[str]
     owner: Index  # (m,), number of the effect of each version
-    inner: Values  # (t, s, m, k, k), products of columns
-    cross: Values  # (t, s, m, k), with the readings
+    inner: Sequence[Values]  # of successive versions with k columns: (t, s, m', k, k), their products
+    cross: Sequence[Values]  # (t, s, m', k), those with the readings
     score: Values  # (scales, t, s, m), log E
     squares: Values  # (scales, t, s, m), RSS
 
-    def under(self, kept: Values) -> CandidateBlock:
-        """Return the block under some of the hypotheses."""
-        score, squares = self.score[:, kept], self.squares[:, kept]
-        return replace(self, inner=self.inner[kept], cross=self.cross[kept], score=score, squares=squares)
+    def under(self, kept: Values) -> Further:
+        """Return the same under some of the hypotheses."""
+        inner, cross = ([values[kept] for values in each] for each in (self.inner, self.cross))
+        return replace(self, inner=inner, cross=cross, score=self.score[:, kept], squares=self.squares[:, kept])
 
     @property
     def starts(self) -> Index:
@@ -242,20 +241,20 @@ class CandidateBlock:
 
     def mixtures(self, number: int, names: Collection[str], problem: CandidateProblem) -> dict[str, Mixture]:
         """Return the distribution of the parameters of some of the effects over their limits, given one of the sets."""
-        mixtures = {}
+        mixtures, first = {}, 0
         score, squares = self.score[:, :, number], self.squares[:, :, number]
-        inner, cross = self.inner[:, number], self.cross[:, number]
         top = np.maximum.reduceat(np.max(score, axis=(0, 1)), self.starts)
         kept = score > top[self.owner] + np.log(NEGLIGIBLE_MIXTURE_WEIGHT)
-        s, t, m = np.nonzero(kept)
-        inverse = np.linalg.inv(inner[t, m] + LIMIT_SCALES[s, None, None] ** -2.0 * np.eye(inner.shape[-1]))
-        mean, weight = (inverse @ cross[t, m, :, None])[..., 0], score[kept]
-        variance = np.einsum("nkk->nk", inverse) * problem.variance(squares[kept])[:, None]
-        deviation = np.sqrt(np.maximum(variance, 0.0))
-        for j, name in enumerate(self.names):
-            if name in names:
-                of_effect = self.owner[m] == j
-                mixtures[name] = weight[of_effect], mean[of_effect], deviation[of_effect]
+        for inner, cross in zip(self.inner, self.cross, strict=True):
+            s, t, m = np.nonzero(kept[:, :, first : first + inner.shape[2]])
+            components, owner = (s, t, first + m), self.owner[first + m]
+            inverse = np.linalg.inv(inner[t, number, m] + LIMIT_SCALES[s, None, None] ** -2.0 * np.eye(inner.shape[-1]))
+            mean, weight = (inverse @ cross[t, number, m, :, None])[..., 0], score[components]
+            variance = np.einsum("nkk->nk", inverse) * problem.variance(squares[components])[:, None]
+            deviation, first = np.sqrt(np.maximum(variance, 0.0)), first + inner.shape[2]
+            for j in [j for j in np.unique(owner).tolist() if self.names[j] in names]:
+                of_effect = owner == j
+                mixtures[self.names[j]] = weight[of_effect], mean[of_effect], deviation[of_effect]
         return mixtures
 
 

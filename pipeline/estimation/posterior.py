@@ -33,10 +33,10 @@ from pipeline.estimation.evidence import (
     LIMIT_SCALES,
     NEGLIGIBLE_MIXTURE_WEIGHT,
     SCALE_PRIOR,
-    CandidateBlock,
     CandidateProblem,
     Conditional,
     EffectSet,
+    Further,
     Given,
     Mixture,
     Pick,
@@ -110,8 +110,8 @@ class SetSearch:
         self.problem, self.required = problem, frozenset(required)
         self.pool: dict[EffectSet, Found] = {}
         self._known: dict[frozenset[tuple[str, Pick]], dict[str, Conditional]] = {}  # with each effect, given picks
-        # blocks of all effects, and the number of the set among theirs, given picks
-        self._blocks: dict[frozenset[tuple[str, Pick]], tuple[list[CandidateBlock], int]] = {}
+        # all effects in addition to some sets, and the number of the set, given picks
+        self._further: dict[frozenset[tuple[str, Pick]], tuple[Further, int]] = {}
         self._extended: set[EffectSet] = set()
         first = [*dict.fromkeys([self.required, *(frozenset(seed) | self.required for seed in seeds)])]
         self._prune(first)
@@ -129,8 +129,9 @@ class SetSearch:
     def mixtures(self, names: EffectSet, but: EffectSet, added: Sequence[str]) -> dict[str, Mixture]:
         """Return the distribution of the parameters of further effects, given a set without some of its members."""
         picks = {n: pick for n, pick in self.pool[names].picks.items() if n not in but}
-        blocks, number = self._blocks.get(frozenset(picks.items())) or (Given(self.problem, [picks]).blocks(added), 0)
-        return {n: m for block in blocks for n, m in block.mixtures(number, added, self.problem).items()}
+        known = self._further.get(frozenset(picks.items()))
+        further, number = known or (Given(self.problem, [picks]).further(added), 0)
+        return further.mixtures(number, added, self.problem)
 
     def _prune(self, seeds: Sequence[EffectSet]) -> None:
         """Remove the noise hypotheses that have no weight given any of the sets ``seeds``."""
@@ -138,14 +139,16 @@ class SetSearch:
         for names in seeds:
             picks = dict.fromkeys(sorted(names), FIRST_VERSION_AND_SCALE)
             given, allowed = Given(self.problem, [picks]), self._allowed(names)
-            blocks = given.blocks(allowed)
-            if len(allowed) == len(self.problem.versions):
-                self._blocks[frozenset(picks.items())] = blocks, 0
-            best = [np.maximum.reduceat(np.max(b.score[:, :, 0], axis=0), b.starts, axis=1) for b in blocks]
-            scores = np.concatenate([given.alone(), *best], axis=1)
+            scores = given.alone()
+            if allowed:
+                further = given.further(allowed)
+                best = np.maximum.reduceat(np.max(further.score[:, :, 0], axis=0), further.starts, axis=1)
+                scores = np.concatenate([scores, best], axis=1)
+                if len(allowed) == len(self.problem.versions):
+                    self._further[frozenset(picks.items())] = further, 0
             kept |= np.any(scores > scores.max(axis=0) + np.log(NEGLIGIBLE_MIXTURE_WEIGHT), axis=1)
         self.problem = self.problem.under(kept)
-        self._blocks = {key: ([block.under(kept) for block in each], n) for key, (each, n) in self._blocks.items()}
+        self._further = {key: (further.under(kept), n) for key, (further, n) in self._further.items()}
 
     def _allowed(self, names: EffectSet) -> list[str]:
         barred = names.union(*(self.problem.excluded.get(n, frozenset()) for n in names))
@@ -182,20 +185,21 @@ class SetSearch:
 
     def _extend(self, level: Sequence[EffectSet]) -> list[EffectSet]:
         """Add every allowed effect to some sets; return the new sets."""
-        level = [names for names in level if len(names) < MAX_SET_SIZE + len(self.required)]
+        most = MAX_SET_SIZE + len(self.required)
+        level = [names for names in level if len(names) < most and self._allowed(names)]
         new = [names for names in level if names not in self._extended]
         self._extended.update(new)
         for names in new:
             self._finish(names)
         keys = {names: frozenset(self.pool[names].picks.items()) for names in new}
-        unknown = [names for names in new if keys[names] not in self._blocks]
+        unknown = [names for names in new if keys[names] not in self._further]
         if unknown:
-            blocks = Given(self.problem, [self.pool[names].picks for names in unknown]).blocks([*self.problem.versions])
-            self._blocks |= {keys[names]: (blocks, number) for number, names in enumerate(unknown)}
+            given = Given(self.problem, [self.pool[names].picks for names in unknown])
+            further = given.further([*self.problem.versions])
+            self._further |= {keys[names]: (further, number) for number, names in enumerate(unknown)}
         for names in new:
-            parent, (blocks, number) = self.pool[names], self._blocks[keys[names]]
-            evidence = {n: each for block in blocks for n, each in block.conditionals[number].items()}
-            self._known[keys[names]] = evidence
+            parent, (further, number) = self.pool[names], self._further[keys[names]]
+            self._known[keys[names]] = evidence = further.conditionals[number]
             for name in self._allowed(names):
                 child, (total, best, pick) = names | {name}, evidence[name]
                 score, known = total + parent.spread + ODDS * len(child), self.pool.get(child)
@@ -217,7 +221,7 @@ class SetSearch:
                 others = {n: pick for n, pick in picks.items() if n != name}
                 known_of = self._known.setdefault(frozenset(others.items()), {})
                 if name not in known_of:
-                    known_of |= Given(self.problem, [others]).blocks([name])[0].conditionals[0]
+                    known_of |= Given(self.problem, [others]).further([name]).conditionals[0]
                 total, score, picks[name] = known_of[name]
                 spread += total - score
             if picks == before:

@@ -15,6 +15,7 @@ from pipeline.core.records import Motion
 from pipeline.estimation.candidates import time_constants
 from pipeline.estimation.evidence import (
     LIMIT_SCALES,
+    READINGS,
     SCALE_PRIOR,
     CandidateProblem,
     Given,
@@ -88,7 +89,8 @@ class Dense:
             for name, start, stop in zip(NAMES, edges[:-1], edges[1:], strict=True)
         }
         limits = {name: np.ones(k) for name, k in NAMES.items()}
-        return CandidateProblem(np.array(products), np.array(prior), 0.0, len(self.y) - 2.0, versions, limits)
+        padded = np.pad(np.array(products), ((0, 0), (0, 1), (0, 1)))
+        return CandidateProblem(padded, np.array(prior), 0.0, len(self.y) - 2.0, versions, limits)
 
 
 @pytest.mark.parametrize("sizes", [{}, {"a": 0.1}, {"a": 0.3, "c": 0.05}], ids=["nothing", "weak", "two"])
@@ -119,11 +121,11 @@ def test_the_probabilities_of_all_sets_are_those_of_their_evidence_and_sum_to_on
 def test_residuals_below_the_known_noise_are_no_evidence_of_less_noise() -> None:
     dense = Dense(3, {"a": 0.0, "b": 0.0, "c": 0.0})
     problem = dense.problem()
-    free, size = problem.free, 0.3 * problem.free / float(problem.products[0, -1, -1])
+    free, size = problem.free, 0.3 * problem.free / float(problem.products[0, READINGS, READINGS])
     for factor, known in ((size, True), (1e4 * size, False)):  # of the readings' squares
         products = problem.products.copy()
-        products[:, -1] *= np.sqrt(factor)
-        products[:, :, -1] *= np.sqrt(factor)
+        products[:, READINGS] *= np.sqrt(factor)
+        products[:, :, READINGS] *= np.sqrt(factor)
         given = Given(replace(problem, products=products, least=1.0), [{}, {"b": (0, 2)}])
         rss = given.squares[0]
         assert bool(np.all(rss < free)) == known
