@@ -254,7 +254,7 @@ def _made(module: ModuleType, job: Job, unit: str, settings: Settings) -> Files:
     if job.stage not in STEPS:
         files: Files = getattr(module, f"{job.stage}_unit")(job, unit, settings)
         return files
-    from pipeline.app.steps.unit_files import FILES, RESULTS, StoredUnit  # noqa: PLC0415  (numpy, for the jobs only)
+    from pipeline.app.steps.unit_files import DOCUMENT_OF, FILES, RESULTS, StoredUnit  # noqa: PLC0415  (for the jobs only)
 
     stage, last = job.run.get("stage", ""), job.run.get("last", {}).get(unit, "")
     if stage == EFFECTS_STAGE != last:  # other units of the batch have effects
@@ -264,7 +264,9 @@ def _made(module: ModuleType, job: Job, unit: str, settings: Settings) -> Files:
     if of_batch := getattr(module, f"{job.stage}_in_batch", None):
         made = of_batch(job, unit, settings, made)
     RESULTS.made(unit, STEPS[job.stage].returns, made)
-    return FILES[job.stage](unit, made)
+    files = FILES[job.stage](unit, made)
+    RESULTS.made(unit, DOCUMENT_OF.get(job.stage, ""), files.get(f"{unit}.json"))
+    return files
 
 
 def _encoded(job: Job, files: Files) -> dict[str, bytes]:

@@ -25,6 +25,7 @@ Result = TypeVar("Result")
 MOST_KEPT_BYTES = 150_000_000
 BYTES_OF_SAMPLE = 88  # time, two sensors, temperature, and the angle, rate or attitude of a table: 11 numbers
 READ_LATER = {name for step in STEPS.values() for name in step.reads}
+DOCUMENT_OF = {"validate": "validation", "diagnose": "diagnosis"}  # of stages that return an object
 
 
 class ResultsInMemory:
