@@ -39,7 +39,7 @@ from typing import Self
 import numpy as np
 
 from pipeline.core.errors import ConfigurationError, ConvergenceError, InputError
-from pipeline.core.records import FittedEffect, Mask, Motion, SensorCalibration, Values
+from pipeline.core.records import FittedEffect, Mask, Motion, SensorCalibration, Values, finite_rows
 from pipeline.physics.effects import effect_of, owner_of
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE, Effect, Owner, truth, turning_direction, with_truth
 
@@ -202,7 +202,7 @@ class LogEnd:
 
 
 def _last_known(time: Values, values: Values) -> Known | None:
-    known = np.flatnonzero(np.isfinite(values).all(axis=1))
+    known = np.flatnonzero(finite_rows(values))
     return (float(time[known[-1]]), values[known[-1]]) if len(known) else None
 
 
@@ -265,7 +265,7 @@ def _difference(time: Values, values: Values, before: Known | None) -> Values:
     t_before, v_before = (time[0], values[0]) if before is None else before
     t = np.concatenate([[t_before], time])
     v = np.concatenate([v_before[None], values])
-    known = np.where(np.isfinite(v).all(axis=1), np.arange(len(v)), 0)
+    known = np.where(finite_rows(v), np.arange(len(v)), 0)
     last = np.maximum.accumulate(known)[:-1]  # a missing sample is stepped over
     step = t[1:] - t[last]
     back = np.flatnonzero(step[1 if first else 0 :] <= 0) + (1 if first else 0)

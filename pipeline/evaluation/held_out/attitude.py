@@ -36,6 +36,7 @@ from pipeline.core.records import (
     Values,
     continuous,
     cross,
+    finite_rows,
     level_in_body,
     median,
 )
@@ -52,6 +53,7 @@ from pipeline.estimation.uncertainty_budget import covariance_without_reference
 from pipeline.evaluation.held_out.error_breakdown import NORMAL_FREEDOM, TAIL
 from pipeline.physics.compensation import Compensation
 from pipeline.physics.effects import effect
+from pipeline.physics.effects.base import length
 
 DRIFT_TIME_S = 60.0  # s over which a drift is stated
 DRIFT_STARTS = 60  # starts over which a drift is averaged
@@ -90,7 +92,7 @@ def attitude(
         )
     except InputError as error:
         return {"reason": str(error)}
-    reference = (logged / np.linalg.norm(logged, axis=1, keepdims=True)).T
+    reference = (logged / np.sqrt(np.einsum("ij,ij->i", logged, logged))[:, None]).T
     time = known.time * known.table_seconds  # by the clock of the reference
     shown = np.unique(np.linspace(0, known.samples - 1, CURVE_POINTS).astype(int))
     seconds, curve = float(min(DRIFT_TIME_S, time[-1] - time[0])), {"time_s": _rounded(time[shown] - time[0])}
@@ -106,7 +108,7 @@ def attitude(
             assert force is not None  # noqa: S101
             steps, fused = _fuse(time, force, alone)
             up, true_up = level_in_body(fused), level_in_body(reference[:, steps].T)
-            sine, cosine = np.linalg.norm(cross(up, true_up), axis=1), np.sum(up * true_up, axis=1)
+            sine, cosine = length(cross(up, true_up)), np.einsum("ij,ij->i", up, true_up)
             tilt, since = np.degrees(np.arctan2(sine, cosine)), time[steps] - time[0]
             tilts[name] = float(np.sqrt(np.mean(tilt[since >= min(TILT_SETTLING_S, 0.5 * since[-1])] ** 2)))
             curve[f"tilt_{name}"] = _rounded(np.interp(time[shown] - time[0], since, tilt))
@@ -211,7 +213,7 @@ def _with_reference(recording: Recording) -> tuple[Recording, Values]:
     q = recording.table_attitude
     assert q is not None  # noqa: S101
     readings = [v for v in (recording.accelerometer, recording.gyroscope) if v is not None]
-    known, logged = np.all([np.isfinite(v).all(axis=1) for v in readings], axis=0), np.isfinite(q).all(axis=1)
+    known, logged = np.all([finite_rows(v) for v in readings], axis=0), finite_rows(q)
     clock, q = recording.time[logged], q[logged]
     late = recording.time - float(recording.filter.get("delay_s", 0.0))
     known &= (late >= clock[:1].sum()) & bool(len(clock))

@@ -186,7 +186,7 @@ def _figures(name: str, corrected: Sequence[Corrected]) -> tuple[float, StepErro
     off = vector_errors(corrected, directed=True)[known] if directed else None
     error = error[known]
     mean, total, rms = float(np.mean(np.abs(error))), float(np.sum(np.abs(error))), float(np.sqrt(np.mean(error**2)))
-    vector = None if off is None else float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+    vector = None if off is None else float(np.sqrt(np.vdot(off, off) / len(off)))
     return mean, StepErrors(name, mean, total, float(error.max()), float(error.min()), rms, vector_rms_error=vector)
 
 
@@ -324,7 +324,7 @@ def linearized(calibration: SensorCalibration, samples: Samples) -> LinearizedSa
     vector, magnitude, _ = found
     chosen = samples.representative
     truth = reference_vector(calibration, samples, chosen)
-    along = truth / np.maximum(np.linalg.norm(truth, axis=1, keepdims=True), 1e-300)
+    along = truth / np.maximum(length(truth), 1e-300)[:, None]
     steps = calibration.parameters.standard_uncertainty.tolist()
     J = np.zeros((len(chosen), 3, len(steps)))
     J[:, :, BIAS] = -calibration.matrix
@@ -528,7 +528,7 @@ def _weights(M: Values, each: LinearizedSamples, C: Values, slow: Values) -> Val
     J, noise = each.derivative, each.white_variance + each.wander_variance + slow
     by_axis, of_axis = (v.swapaxes(0, 1).reshape(3, -1) for v in (J, (J.reshape(-1, len(C)) @ C).reshape(J.shape)))
     mean = M * noise.mean(axis=0) @ M.T + of_axis @ by_axis.T / len(J)
-    size = np.linalg.norm(each.truth, axis=1)
+    size = length(each.truth)
     u = each.truth / np.where(size > 0.0, size, 1.0)[:, None]
     g = mean_squares(each.truth, mean)[1][:, None, None]
     return np.asarray((1.0 - g) * u[:, :, None] * u[:, None, :] + g * np.eye(3))

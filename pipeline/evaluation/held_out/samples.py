@@ -30,7 +30,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from pipeline.core.records import Index, Mask, Motion, Noise, Recording, SensorCalibration, Values
+from pipeline.core.records import Index, Mask, Motion, Noise, Recording, SensorCalibration, Values, finite_rows
 from pipeline.core.settings import Settings, Table
 from pipeline.estimation.gauss_markov import variance_of_average
 from pipeline.estimation.observations import filtered_motion
@@ -84,7 +84,7 @@ class Samples:
     @cached_property
     def known(self) -> Mask:
         """Whether a sample has reading and reference: (n,) array."""
-        return np.asarray(np.isfinite(self.reading).all(axis=1) & np.isfinite(self.magnitude))
+        return np.asarray(finite_rows(self.reading) & np.isfinite(self.magnitude))
 
     @cached_property
     def representative(self) -> Index:
@@ -147,7 +147,7 @@ class HeldOutCase:
             chosen = [r for r in chosen if any(getattr(r, log) is not None for log in logs)]
         known = partial(samples_of_motion, other=self.other, smoothed=smoothed, followed=followed)
         found = [known(sensor, r, self.noise, table) for r in chosen if r.role == role]
-        return [s for s in found if s is not None and np.isfinite(s.reading).all(axis=1).any()]
+        return [s for s in found if s is not None and finite_rows(s.reading).any()]
 
     def _means(self, recording: Recording, rests: Sequence[Rest]) -> Samples | None:
         """Return the mean readings of the rests of a recording, or None without any.
@@ -255,7 +255,7 @@ def reference_vector(calibration: SensorCalibration, samples: Samples, at: Mask 
     direction = np.full((len(samples.time), 3), np.nan)[at]
     if samples.motion is not None:
         direction = truth(samples.sensor, samples.motion)[at]
-    if (unknown := ~np.isfinite(direction).all(axis=1)).any():
+    if (unknown := ~finite_rows(direction)).any():
         direction = np.where(unknown[:, None], linear_truth(calibration, samples.reading[at]), direction)
     size = length(direction)[:, None]
     if not np.all(size > 0):
@@ -301,7 +301,7 @@ def _rate(
         return np.abs(logged)
     of_table = rate
     if earth is not None and motion.level is not None:
-        of_table = np.linalg.norm(motion.angular_rate - earth_in_body(earth, motion.level), axis=1)
+        of_table = length(motion.angular_rate - earth_in_body(earth, motion.level))
     return np.asarray(np.abs(logged) + (rate - of_table))
 
 
@@ -312,7 +312,7 @@ def _rate_by_angle(recording: Recording) -> EncoderRate | None:
         return by_angle
     if recording.table_attitude is not None or recording.gyroscope is None:
         return None
-    finite = recording.gyroscope[np.isfinite(recording.gyroscope).all(axis=1)]
+    finite = recording.gyroscope[finite_rows(recording.gyroscope)]
     if len(finite) < MIN_RATE_SAMPLES:
         return None
     spread = np.linalg.eigvalsh(np.cov(finite.T))
@@ -338,7 +338,7 @@ def mean_squares(truth: Values, S: Values) -> tuple[Values, Values]:
     """Return ``E(|t + x| - |t|)^2`` and its weight g, for (n, 3) truths and errors x of covariance S: (n,) arrays."""
     size, total = length(truth), float(np.trace(S))
     u = truth / np.where(size > 0.0, size, 1.0)[:, None]
-    along = np.sum(u @ S * u, axis=1)
+    along = np.einsum("ij,ij->i", u @ S, u)
     squares, g = along.copy(), np.zeros(len(truth))
     near = (size <= LINEAR_FROM * np.sqrt(total)) & (total > 0.0)
     if near.any():

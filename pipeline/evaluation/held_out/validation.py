@@ -61,6 +61,7 @@ from pipeline.core.records import (
     TemperatureBin,
     UnitRecordings,
     Values,
+    finite_rows,
 )
 from pipeline.core.settings import SensorLimits, Settings, Uncertainty
 from pipeline.estimation import reference_least_squares
@@ -283,9 +284,9 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
         if found is None or found[2] is None or not breakdown.direction_known(calibration, samples):
             return None
         reading, truth = found[0], found[2]
-        known = samples.known & np.isfinite(np.hstack([reading, truth])).all(axis=1)
+        known = samples.known & finite_rows(reading + truth)
         chosen = truth[samples.representative]
-        rows = np.isfinite(chosen).all(axis=1)
+        rows = finite_rows(chosen)
         columns = np.column_stack([np.ones(np.count_nonzero(rows)), chosen[rows]])
         products = columns.T @ part.derivative[rows].reshape(len(columns), -1)
         per_parameter = (np.linalg.pinv(columns.T @ columns, hermitian=True) @ products)[1:].reshape(3, 3, -1)
@@ -450,7 +451,7 @@ def _at_mean_temperature(
         return found, calibration
     others = tuple(e for e in calibration.effects if e.name not in found)
     left = _calibrated(replace(calibration, effects=others), fitted)
-    known = np.isfinite(left + truth).all(axis=1)
+    known = finite_rows(left + truth)
     factor = np.linalg.lstsq(left[known], truth[known], rcond=None)[0].T
     return found, replace(calibration, matrix=factor @ calibration.matrix)
 
@@ -464,16 +465,15 @@ def _fitted(calibration: SensorCalibration, part: str, left: Values, truth: Valu
         if left is truth:
             return calibration.bias, matrix
         change = left - truth
-        change = change[np.isfinite(change).all(axis=1)]
-        return calibration.bias + np.mean(change @ K.T, axis=0), matrix
-    known = np.isfinite(left + truth).all(axis=1)
-    if not known.all():
-        left, truth = left[known], truth[known]
+        change = change[finite_rows(change)]
+        return calibration.bias + K @ np.einsum("ij->j", change) / len(change), matrix
+    known = finite_rows(left + truth)
+    left, truth = left[known], truth[known]
     reading = left @ K.T  # minus the bias
-    mean, mean_truth = reading.mean(axis=0), truth.mean(axis=0)
+    mean, mean_truth = (np.einsum("ij->j", v) / len(v) for v in (reading, truth))
     off, change = reading - mean, truth - mean_truth
     if part != "none" and _spread(off) >= LEAST_SPREAD_G:
-        diagonal = np.diag(np.sum(off * change, axis=0) / np.sum(off**2, axis=0))
+        diagonal = np.diag(np.einsum("ij,ij->j", off, change) / np.einsum("ij,ij->j", off, off))
         matrix = np.linalg.lstsq(off, change, rcond=None)[0].T if part == "full" else diagonal
     return calibration.bias + mean - np.linalg.solve(matrix, mean_truth), matrix
 

@@ -23,7 +23,7 @@ from pipeline.estimation.multi_position.model import motion_at_rests
 from pipeline.estimation.noise_terms import TERM_UNITS, allan_variance
 from pipeline.estimation.rest_means import SOAK, gathered, split_rests
 from pipeline.evaluation.diagnosis.words import plain
-from pipeline.evaluation.held_out.error_breakdown import with_known_effects
+from pipeline.evaluation.held_out.error_breakdown import vector_errors, with_known_effects
 from pipeline.evaluation.held_out.samples import OTHER_SENSOR, samples_of_motion
 from pipeline.output.pages.chart import (
     AXES_LEGEND,
@@ -181,9 +181,9 @@ def held_out_figures(
         reference = recording if needed else replace(recording, table_attitude=None)
         samples = samples_of_motion(sensor, reference, SILENT, table, other=fits.get(OTHER_SENSOR[sensor]))
         if samples is not None:
-            vector, magnitude, _ = with_known_effects(fits[sensor], samples)
-            raw = np.linalg.norm(samples.reading, axis=1) - samples.magnitude
-            after, name = np.linalg.norm(vector, axis=1) - magnitude, f"{sensor}-held-out-{recording.name}"
+            steps = (samples.reading, samples.magnitude, None), with_known_effects(fits[sensor], samples)
+            raw, after = (vector_errors([step], directed=False)[:, 0] for step in steps)
+            name = f"{sensor}-held-out-{recording.name}"
             figures.append(held_out_over_time(name, sensor, recording, raw, after, floor=floor, by_hand=by_hand))
     return figures
 

@@ -40,9 +40,11 @@ from pipeline.core.records import (
     Recording,
     SensorCalibration,
     Values,
+    finite_rows,
 )
 from pipeline.core.settings import DataSheet, Table
 from pipeline.core.verdicts import Verdict
+from pipeline.estimation.candidates import limits_of
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW, min_delta_bic
 from pipeline.estimation.posterior import prior_limit
 from pipeline.evaluation.diagnosis.words import plain
@@ -61,7 +63,7 @@ from pipeline.output.pages.chart import (
 from pipeline.output.pages.group_charts import Point, bars, stems
 from pipeline.output.pages.pages import measured, number, percent, unit_text
 from pipeline.physics.effects import catalogue
-from pipeline.physics.effects.base import largest_by_unit, parameter_limits
+from pipeline.physics.effects.base import largest_by_unit
 from pipeline.physics.kinematics import table_motion
 from pipeline.physics.measurement import predicted_reading
 from pipeline.physics.signal.encoder_rate import rate_by_angle
@@ -171,7 +173,7 @@ class _BinnedMean:
 def _of_errors(error: Values) -> tuple[Values, Mask, Values]:
     """Return what ``_binned_mean`` needs of residuals (n, 3), for any covariate."""
     mean_square = np.einsum("ij,ij->j", error, error) / max(len(error), 1)  # without the squares, which may have 50 MB
-    return error, np.asarray(np.isfinite(error).all(axis=1)), np.asarray(mean_square)
+    return error, finite_rows(error), np.asarray(mean_square)
 
 
 def _binned_mean(covariate: Values, error: Values, finite: Mask, mean_square: Values) -> _BinnedMean | None:
@@ -324,9 +326,9 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
     for i, axis in enumerate(AXES):
         layers = [Area(-2 * sigma[i], 2 * sigma[i]), SampleMarks(x, residual.error[:, i], i, mean=True)]
         panels.append(Panel(layers, f"{axis}, {unit}", height=56, limits=(-top, top)))
-    rms = np.sqrt(np.mean(residual.error**2, axis=0))
-    ratio, outside = float((rms / sigma).max()), float(np.mean(np.abs(residual.error) > 2 * sigma))
-    by_encoder = float(residual.reference_noise.max())
+    rms = np.sqrt(np.einsum("ij,ij->j", residual.error, residual.error) / len(residual.error))
+    outside = np.count_nonzero(np.abs(residual.error) > 2 * sigma) / residual.error.size
+    ratio, by_encoder = float((rms / sigma).max()), float(residual.reference_noise.max())
     by_reference = (AXES[int(np.argmax(residual.reference_noise))], by_encoder) if known and by_encoder else None
     about = {"name": name, "ratio": ratio, "outside": outside, "reference": by_reference, "known": known}
     finding, caption, description = sentences("model", **about, rms=rms.tolist(), unit=unit, noise=NOISE_ALONE_RATIO)
@@ -344,13 +346,10 @@ def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:
     if found.get("verdict") == Verdict.UNEXPLAINED:  # a model that does not explain the residual limits nothing
         return []
     rows, open_effects = [], {name for answer in found.get("answer_set") or [] for name in answer["effects"]}
-    known = catalogue()
+    known, sizes = catalogue(), limits_of(sensor, data_sheet)
     for name, limits in (found.get("upper_limit") or {}).items():
-        effect = known.get(name)
-        stated: dict[str, float] = {}
-        if effect is not None:
-            values = parameter_limits(effect, sensor, data_sheet.effects).tolist()
-            stated = dict(zip((p.name for p in effect.parameters(sensor)), values, strict=True))
+        names = [p.name for p in known[name].parameters(sensor)] if name in sizes else []
+        stated = dict(zip(names, sizes[name].tolist() if names else (), strict=True))
         text = ", ".join(f"{number(v, 2)} {unit_text(unit)}".rstrip() for unit, v in largest_by_unit(limits).items())
         shares = {key: v["value"] / stated[key] for key, v in limits.items() if np.isfinite(stated.get(key, np.inf))}
         share = max(shares.values(), default=None)
