@@ -250,12 +250,12 @@ class Forms:
         self._columns = of_coarse  # those of the finer constants would have as much memory again
         return _best_of_each([*best, *self._polynomials()])
 
-    def may_leave(self, mean_square: float, times: float = MAX_FORMULA_TERMS) -> bool:
+    def may_leave(self, mean_square: float) -> bool:
         """Return whether a formula may leave so small a mean square of the residual.
 
         It may not if terms that explain no more together than apart leave more: in addition to given terms, all that
-        others explain is at most so many ``times`` what the best one does, and what the given ones explain with finer
-        constants. White noise leaves least. A term is a factor with any modulator, a band, or a polynomial.
+        ``MAX_FORMULA_TERMS`` explain is at most so many times what the best one does, and what the given ones explain
+        with finer constants. White noise leaves least. A term is a factor with any modulator, a band, or a polynomial.
         """
         rows, root, first, bands, terms = self._screened
         axes, ones, explained = [(self.scan.white(c, rows), *terms[c]) for c in range(3)], np.ones_like(root), 0.0
@@ -265,7 +265,7 @@ class Forms:
             of_bands = np.sum([axis.explained(bands, ones) for axis, *_ in axes], axis=0)
             polynomials = np.sum([axis.explained_together(powers) for axis, *_, powers in axes], axis=0)
             most = max(products.max(), of_bands.max(), polynomials.max())
-            if excess - explained > times * most + BETWEEN_PLACES * explained:
+            if excess - explained > MAX_FORMULA_TERMS * most + BETWEEN_PLACES * explained:
                 return False
             f, m = np.unravel_index(products.argmax(), products.shape)
             columns = slice(first[f], first[f] + len(self._factors[0][f].texts))
@@ -366,22 +366,17 @@ def _best_of_each(scored: Iterable[ScoredForm]) -> list[ScoredForm]:
     return sorted(best.values(), key=lambda each: -each.score)
 
 
-def search(grammar: Forms, far: float) -> tuple[list[ScoredForm], list[ScoredForm]]:
-    """Return the terms of the best form, none if none is clear, and all forms of one term, best first.
-
-    ``far``: mean square of the residual; if not 0, no term is returned where further ones cannot leave so little.
-    """
+def search(grammar: Forms) -> tuple[list[ScoredForm], list[ScoredForm]]:
+    """Return the terms of the best form, none if none is clear, and all forms of one term, best first."""
     terms: list[ScoredForm] = []
-    first = ranked = [] if far and not grammar.may_leave(far) else grammar.ranked()
-    least = 0.0
-    while ranked and ranked[0].clear and ranked[0].gain.delta_bic > least:
+    first = ranked = grammar.ranked()
+    while ranked and ranked[0].clear:
+        if terms and ranked[0].gain.delta_bic <= MIN_FURTHER_GAIN_SHARE * terms[0].gain.delta_bic:
+            break
         terms.append(ranked[0])
-        least = MIN_FURTHER_GAIN_SHARE * terms[0].gain.delta_bic
         if len(terms) == MAX_FORMULA_TERMS:
             break
         grammar.explain([text for term in terms for text in term.form.formulas])
-        if far and not grammar.may_leave(far, (1.0 + BETWEEN_PLACES) * (MAX_FORMULA_TERMS - len(terms))):
-            return [], first
         ranked = [each for each in grammar.ranked() if not any(each.form.refines(term.form) for term in terms)]
     return terms, first
 
@@ -422,7 +417,9 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
     for context in [selection, alone] if selection.names else [selection]:
         grammar = grammar.at(context) if grammar else Forms(context)
         far = FAR_ABOVE * floor if FAR_ABOVE * floor < context.fit.residual_rms else 0.0
-        terms, ranked = search(grammar, far**2)
+        if far and not grammar.may_leave(far**2):
+            continue
+        terms, ranked = search(grammar)
         if not terms:
             continue
         found, first = _fitted_form(context, terms), terms[0]

@@ -359,7 +359,7 @@ def limit_rows(sensor: str, found: JSON, data_sheet: DataSheet) -> list[JSON]:
             most = limits[max(shares, key=shares.__getitem__)]
             row["label"] = f"{plain(name)}: below {number(most['value'], 2)} {unit_text(most['unit'])}".rstrip()
         rows.append(row)
-    return sorted(rows, key=lambda row: -(row["share"] or 0.0))
+    return sorted(rows, key=lambda row: -float(f"{row['share'] or 0.0:.6g}"))  # equal ones in the order of their names
 
 
 def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
