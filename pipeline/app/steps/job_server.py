@@ -33,8 +33,8 @@ KEEP_FREED_MEMORY |= {"ARROW_DEFAULT_MEMORY_POOL": "system"}
 # unit, with 10,000 2 ms; without it 100 units need 630 MB in place of 440.
 NEW_OBJECTS = 10_000
 LAST = [*STEPS][-1]  # of a batch: its process ends
-# Of memory with which a process ends after its job; the rules state 1 GB for a job. With 600 MB, batches of 160 units read
-# their recordings from files again for the page, in 6 ms a unit.
+# Of memory with which a process ends after its job; the rules state 1 GB for a job. With 600 MB, batches of 160 units
+# read their recordings from files again for the page, in 6 ms a unit.
 MOST_BYTES = 750_000_000
 
 
