@@ -81,7 +81,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, default=100)
     parser.add_argument("--simulated", type=int, default=1000, help="most units with recordings of their own")
-    parser.add_argument("--mixed", action="store_true", help="units that cost more among them")
+    parser.add_argument("--mixed", action="store_true", help="with units that cost more, a tenth each of two kinds")
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--figures", type=Path, help="file for cost and ratio")
     parser.add_argument("--folder", type=Path, help="where everything stays, for a run that may be interrupted")

@@ -38,7 +38,7 @@ from pipeline.checks.at_rest import check_axes, check_static, with_rates_at_rest
 from pipeline.checks.evidence import place, refusal
 from pipeline.checks.mounting import check_mounting
 from pipeline.checks.reference import check_motion, check_turns
-from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Note, Recording, Values
+from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Note, Recording, Values, finite_rows
 from pipeline.core.settings import Settings, Table
 from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.physics.kinematics import normal_gravity_g
@@ -294,7 +294,7 @@ def _decimals(recording: Recording) -> tuple[int, ...]:
     for sensor in SENSORS:
         reading = recording.reading(sensor)
         part = np.zeros((0, 3)) if reading is None else reading[:OF_DECIMALS]
-        part = part[np.isfinite(part).all(axis=1)]
+        part = part[finite_rows(part)]
         possible = np.arange(1, MAX_SIGNIFICANT_DIGITS)
         for rows in (part[:FIRST_OF_DECIMALS], part):
             off = np.abs(rows - np.rint(rows * TENFOLD[possible - 1]) / TENFOLD[possible - 1])

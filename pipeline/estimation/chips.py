@@ -38,6 +38,7 @@ from pipeline.core.records import (
     SensorCalibration,
     Values,
     coverage_factor,
+    finite_rows,
     noise_of_steps,
     standard_uncertainty,
 )
@@ -140,7 +141,7 @@ def shared(reference: Chip, other: Chip, sensors: Sequence[str]) -> list[Shared]
 def _truth(chip: Chip, recording: Recording, sensors: Sequence[str]) -> tuple[ChannelValues, Mask]:
     """Return the calibrated readings of a chip, and which samples are valid."""
     readings = {s: np.asarray(recording.reading(s)) for s in sensors}
-    valid = recording.valid & np.all([np.isfinite(v).all(axis=1) for v in readings.values()], axis=0)
+    valid = recording.valid & np.all([finite_rows(v) for v in readings.values()], axis=0)
     given: dict[str, Any] = {s: np.where(valid[:, None], v, 0.0) for s, v in readings.items()}
     compensation = Compensation(chip.calibrations["accelerometer"], chip.calibrations["gyroscope"], chip.unit)
     truth = compensation.apply(**given, temperature=recording.temperature, time=recording.time)

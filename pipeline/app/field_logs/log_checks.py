@@ -23,7 +23,7 @@ import numpy as np
 
 from imu_logs.units import FORCE_UNITS
 from pipeline.core.errors import InputError
-from pipeline.core.records import SENSORS, Mask, Values
+from pipeline.core.records import SENSORS, Mask, Values, finite_rows
 
 DECIMALS = 12  # in the output of ``apply``: far below the resolution of sensors, above the rounding of a double
 TEMPERATURE_RANGE, SOAKED = "temperature_degc", "soaked_degc"  # of ``calibrated_range``
@@ -192,7 +192,7 @@ class LogChecks:
         warnings += self._beyond(calibrated)
         if self.windows:
             table = {k: np.concatenate([w[k] for w in self.windows]) for k in self.windows[0]}
-            valid = np.all([np.isfinite(v.reshape(len(v), -1)).all(axis=1) for v in table.values()], axis=0)
+            valid = np.all([finite_rows(v.reshape(len(v), -1)) for v in table.values()], axis=0)
             table = {k: v[valid] for k, v in table.items()}
             if valid.any():
                 warnings += self._units(table) + self._rests(table, calibrated)

@@ -47,6 +47,7 @@ from pipeline.core.records import (
     SensorDiagnosis,
     SensorValidation,
     Values,
+    finite_rows,
     median,
     once,
 )
@@ -461,7 +462,7 @@ def _about_mean(times: Values, error: Values | None) -> tuple[float, Values]:
     """Return the interval of a recording's samples, and its known errors less their mean: (n, 3) array."""
     if error is None or len(times) < 2:
         return 1.0, np.zeros((0, 3))
-    values = error[np.isfinite(error).all(axis=1)]
+    values = error[finite_rows(error)]
     return float(median(np.diff(times))), values - values.mean(axis=0) if len(values) else values
 
 

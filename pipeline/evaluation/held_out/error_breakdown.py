@@ -63,6 +63,7 @@ from pipeline.core.records import (
     StepErrors,
     Values,
     corrected,
+    finite_rows,
 )
 from pipeline.core.settings import Settings, Table
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, STATED_WIDTH, block_covariance
@@ -146,7 +147,7 @@ def errors_of(calibrations: Sequence[SensorCalibration], samples: Sequence[Sampl
         found, remaining = [], known.copy()
         for calibration in calibrations:  # one by one: the errors of a long recording have 100 MB each
             error = of(calibration)
-            remaining &= np.isfinite(error).all(axis=1)
+            remaining &= finite_rows(error)
             found.append(InPieces.of(error if known.all() else error[known]))
         alike = len({each.mean.shape[1] for each in found}) == 1
         if alike and np.array_equal(remaining, known):

@@ -45,7 +45,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.records import MEDIAN_SIZE, Mask, Recording, Values, median, noise_of_steps, once
+from pipeline.core.records import MEDIAN_SIZE, Mask, Recording, Values, finite_rows, median, noise_of_steps, once
 from pipeline.physics.signal.filters import filter_autocovariance, variance_of_mean
 
 Spans = list[tuple[int, int]]
@@ -129,7 +129,7 @@ def creep_of_rest(recording: Recording, start: int, stop: int) -> Creep:
     """Return the creep in the samples ``start <= n < stop`` of a recording, without flagged and missing ones."""
     force = recording.accelerometer
     assert force is not None  # noqa: S101
-    good = (recording.valid[start:stop]) & np.isfinite(force[start:stop]).all(axis=1)
+    good = (recording.valid[start:stop]) & finite_rows(force[start:stop])
     count = np.array([max(int(good.sum()), 1)])
     share = float(variance_of_mean(filter_autocovariance(recording), count)[0])
     return creep_of_readings(recording.time[start:stop][good], force[start:stop][good], share)

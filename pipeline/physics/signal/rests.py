@@ -30,7 +30,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.core.records import BETWEEN_ATTITUDES_S, Integers, Mask, Recording, Values, median, noise_of_steps, once
+from pipeline.core.records import (
+    BETWEEN_ATTITUDES_S,
+    Integers,
+    Mask,
+    Recording,
+    Values,
+    finite_rows,
+    median,
+    noise_of_steps,
+    once,
+)
 from pipeline.physics.signal.filters import filter_autocovariance, stretch_starts
 from pipeline.physics.signal.quiet_motion import (
     RATE_LIMIT_DPS,
@@ -193,7 +203,7 @@ def _quiet_parts(recording: Recording) -> tuple[Spans, float]:
     if readings is None or recording.samples < 2 * size:
         return [], 0.0
     variance = windows(readings, size)[1]
-    steps = np.abs(np.diff(readings[np.isfinite(readings).all(axis=1)], axis=0))
+    steps = np.abs(np.diff(readings[finite_rows(readings)], axis=0))
     rounding = float(np.sum(counts_of(steps) ** 2)) / 12.0
     noise = max(float(np.percentile(variance, 5.0)), rounding, MIN_NOISE_VARIANCE_G2)
     variance[_spoilt(recording, size)] = np.inf
@@ -290,7 +300,7 @@ def _spoilt(recording: Recording, size: int) -> Mask:
     bad = ~recording.valid
     for readings in (recording.accelerometer, recording.gyroscope):
         if readings is not None:
-            bad |= ~np.isfinite(readings).all(axis=1)
+            bad |= ~finite_rows(readings)
     bad[1:] |= np.diff(recording.time_ns) > size * _interval(recording) * 1e9
     total = np.concatenate([[0], np.cumsum(bad)])
     return total[size:] > total[:-size]
