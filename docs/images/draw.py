@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.app.planning.guide import in_words
+from pipeline.app.guide import in_words
 from pipeline.physics.kinematics import LEVEL_AT_ZERO
 from pipeline.physics.signal.rests import SETTLING_S
 from pipeline.simulation.description import Course, plan

@@ -13,7 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from pipeline.__main__ import main
-from pipeline.app.profile_detection.recording_facts import facts
+from pipeline.app.recording_facts import facts
 from pipeline.core.records import Recording
 from pipeline.ingest.arrow import write_recording
 from pipeline.simulation.campaign import write_campaign

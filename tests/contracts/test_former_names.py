@@ -13,7 +13,7 @@ import pytest
 DOCUMENTED = {
     "pipeline.signal.quiet_motion": "pipeline.physics.signal.quiet_motion",
     "pipeline.signal.rests": "pipeline.physics.signal.rests",
-    "pipeline.planning.guide": "pipeline.app.planning.guide",
+    "pipeline.planning.guide": "pipeline.app.guide",
     "pipeline.model.kinematics": "pipeline.physics.kinematics",
     "pipeline.model.effects.base": "pipeline.physics.effects.base",
 }

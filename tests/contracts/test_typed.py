@@ -28,7 +28,7 @@ TAKE_JSON = {
         "app/field_logs/stream.py", "output/history.py", "ingest/arrow.py", "app/one_unit.py",
         "ingest/files.py",
         "physics/compensation.py", "physics/statements.py",
-        "output/outcome.py", "app/planning/plan.py", "core/records/",
+        "output/outcome.py", "app/plan.py", "core/records/",
         "output/pages/", "app/results_folder.py", "app/steps/", "core/verdicts.py",
     ),
 }  # fmt: skip

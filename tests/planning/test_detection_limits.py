@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.app.planning.detection_limits import noise_sums
-from pipeline.app.planning.plan import FAULTLESS, ROOM, plan_of, stated_noise
+from pipeline.app.detection_limits import noise_sums
+from pipeline.app.plan import FAULTLESS, ROOM, plan_of, stated_noise
 from pipeline.core.records import SENSORS
 from pipeline.estimation.design import EffectColumns, ordinary_base
 from pipeline.estimation.gates import passes

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from unit_settings import with_noise
 
-from pipeline.app.planning.guide import (
+from pipeline.app.guide import (
     TURNS_DEG,
     GuideProgress,
     ProposedTurn,
@@ -22,7 +22,7 @@ from pipeline.app.planning.guide import (
     most_informative_turn,
     propose,
 )
-from pipeline.app.planning.guide import progress_of as progress_of_unit
+from pipeline.app.guide import progress_of as progress_of_unit
 from pipeline.core.records import Recording, SensorCalibration
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.stages import StageInput

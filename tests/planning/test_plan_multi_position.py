@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.app.planning.plan import ROOM, changes, of_sensor, select_by_hand, simulate_procedure
+from pipeline.app.plan import ROOM, changes, of_sensor, select_by_hand, simulate_procedure
 from pipeline.estimation.gates import passes
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription

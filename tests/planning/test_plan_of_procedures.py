@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.app.planning.plan import best_changes, changes, helps_most, of_sensor, plan_of, simulate_procedure
+from pipeline.app.plan import best_changes, changes, helps_most, of_sensor, plan_of, simulate_procedure
 from pipeline.core.errors import ConfigurationError
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription

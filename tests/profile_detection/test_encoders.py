@@ -8,7 +8,7 @@ from loggers import GRAVITY
 
 from imu_logs.columns import find_layout
 from imu_logs.proposal import Proposal, not_found
-from pipeline.app.profile_detection.unit_guesses import propose
+from pipeline.app.unit_guesses import propose
 
 HZ = 125.0
 RATE = np.repeat(

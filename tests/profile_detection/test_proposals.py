@@ -16,7 +16,7 @@ from imu_logs.profile import Checks, csv_formats
 from imu_logs.proposal import Proposal
 from imu_logs.text_read import read_csv
 from pipeline.app.config.compose import Composer
-from pipeline.app.profile_detection.unit_guesses import propose
+from pipeline.app.unit_guesses import propose
 from pipeline.core.errors import IngestError
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "data"

@@ -10,13 +10,7 @@ import pytest
 
 from imu_logs.profile import checks_of
 from pipeline.app.config.compose import Composer
-from pipeline.app.profile_detection.recording_facts import (
-    SUITS_FERRARIS,
-    facts,
-    proposed_sheet,
-    rests_in_short,
-    suits_ferraris,
-)
+from pipeline.app.recording_facts import SUITS_FERRARIS, facts, proposed_sheet, rests_in_short, suits_ferraris
 from pipeline.core.settings import RecordingFile
 from pipeline.ingest.arrow import write_recording
 from pipeline.ingest.read import read_table, to_recording

@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.app.planning.guide import fitted_by_hand, progress_of, propose
+from pipeline.app.guide import fitted_by_hand, progress_of, propose
 from pipeline.core.records import Recording, coverage_factor
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
-    from pipeline.app.planning.guide import GuideProgress
+    from pipeline.app.guide import GuideProgress
 
 RATE_HZ, MOVE_S, SETTLES_S = 20.0, 2.5, 0.5  # a rest is found half a second late
 HAND_DEG = 1.0  # as configs/table/hand.yaml

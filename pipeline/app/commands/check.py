@@ -23,7 +23,7 @@ from pipeline.app.commands.readings import Reading, campaign_of, config_of_log, 
 from pipeline.app.config.campaign import Campaign, find_campaign, load_campaign
 from pipeline.app.config.options import nearest
 from pipeline.app.one_unit import try_unit, unit_of_campaign
-from pipeline.app.profile_detection.recording_facts import (
+from pipeline.app.recording_facts import (
     SUITS_FERRARIS,
     Line,
     as_text,
@@ -36,8 +36,8 @@ from pipeline.app.profile_detection.recording_facts import (
     suits_ferraris,
     topic_lines,
 )
-from pipeline.app.profile_detection.unit_guesses import propose
 from pipeline.app.run_progress import Countdown
+from pipeline.app.unit_guesses import propose
 from pipeline.core.errors import UNKNOWN_LAYOUT, ConfigurationError, IngestError, PipelineError, shortened
 from pipeline.core.files import CONFIGS, write_atomically
 from pipeline.core.records import SENSORS, Recording

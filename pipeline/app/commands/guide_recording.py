@@ -16,7 +16,7 @@ import numpy as np
 from imu_logs.profile import checks_of
 from pipeline.app.commands.readings import campaign_of, complete_rows, config_of_log, recordings_of_files
 from pipeline.app.config.campaign import load_campaign
-from pipeline.app.planning.guide import (
+from pipeline.app.guide import (
     MAX_PLANNED_RESTS,
     GuideProgress,
     ProposedTurn,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.app.commands import parser_of
 from pipeline.app.config.options import GROUPS
-from pipeline.app.planning.plan import readme
+from pipeline.app.plan import readme
 from pipeline.core.errors import ConfigurationError, InputError
 from pipeline.core.files import CONFIGS
 from pipeline.core.records import SENSOR_UNITS, SENSORS

@@ -12,7 +12,7 @@ from textwrap import wrap
 from typing import Any
 
 from pipeline.app.commands import parser_of
-from pipeline.app.planning.plan import WIDTH, PlanGain, best_changes, helps_most, plan_of, plan_text
+from pipeline.app.plan import WIDTH, PlanGain, best_changes, helps_most, plan_of, plan_text
 from pipeline.core.errors import ConfigurationError
 from pipeline.physics.effects import read_effect_files, register
 from pipeline.simulation.description import UnitDescription, add_recording_options, described, read_description

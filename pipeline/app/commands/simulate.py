@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from pipeline.app.commands import parser_of
-from pipeline.app.planning.plan import not_shown
+from pipeline.app.plan import not_shown
 from pipeline.app.results_folder import new_simulated, publish_simulated
 from pipeline.app.run_progress import Countdown
 from pipeline.core.errors import ConfigurationError

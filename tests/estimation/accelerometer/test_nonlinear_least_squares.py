@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 from unit_settings import settings_of, with_noise
 
-from pipeline.app.planning.guide import derivative_of
+from pipeline.app.guide import derivative_of
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
 from pipeline.core.records import Recording, SensorCalibration, StageResult, coverage_factor
 from pipeline.core.records.calibration import corrected

@@ -39,7 +39,7 @@ from imu_logs.message_logs import open_reader
 from imu_logs.message_read import LONGEST_ARRAY
 from imu_logs.profile import checks_of, csv_formats
 from imu_logs.units import DEGREES, TRIADS
-from pipeline.app.profile_detection.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
+from pipeline.app.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.checks.bench import other_axes
 from pipeline.core.errors import IngestError, shortened
 from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Note, Recording, median

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.app.planning.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
+from pipeline.app.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
 from pipeline.core.errors import NotObservableError
 from pipeline.core.records import AXES, SENSORS, Fit, Noise, NotCalibrated, Recording, SensorCalibration
 from pipeline.core.settings import DataSheet, Settings, assumed_figures

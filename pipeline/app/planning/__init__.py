@@ -1,1 +1,0 @@
-"""Predict which effects a procedure could find, and propose what to record next."""
