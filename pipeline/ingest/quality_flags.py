@@ -76,6 +76,7 @@ MIN_MEDIAN_MOVES = 3  # for a median
 MOST_MOVES = 40  # bounds the cost
 MAX_ROTATION_SAMPLES = 200_000  # bounds the cost
 FITS_DEG, FAILS_DEG = 15.0, 30.0  # the error of any other possible unit is tens of degrees
+RANGE_FACTORS = (1 / 8, 1 / 4, 1 / 2, 2.0, 4.0, 8.0)  # between full-scale ranges of a gyroscope, 250 to 2000 deg/s
 
 
 def flag_gaps(table: Log, flags: NDArray[np.uint16], checks: Checks) -> list[Note]:
@@ -369,7 +370,10 @@ def _check_attitude(table: Log) -> None:
 
 
 def _check_turn_rate(table: Log) -> None:
-    """Raise ``IngestError`` if rates differ by a factor of 180/pi from the table's, or from gravity's rotation."""
+    """Raise ``IngestError`` if rates differ by a factor of 180/pi from the table's, or from gravity's rotation.
+
+    Where no table is logged, also if they differ from gravity's rotation by the factor of another full-scale range.
+    """
     if "gyro_x" not in table.values:
         return
     stride = -(-len(table.time_ns) // MEDIAN_SAMPLES)
@@ -390,6 +394,10 @@ def _check_turn_rate(table: Log) -> None:
         if 0.7 < ratio / factor < 1.4:
             hint = "correct ingest.csv.columns.gyro_x.unit (gyro_y, gyro_z)"
             raise IngestError(f"{seen}: the numbers look like {what}", table.path, code="implausible_rate", hint=hint)
+    if not {"table_angle", "table_rate"} & table.values.keys():
+        what = "the gyroscope has another full-scale range than declared, or the times are wrong by this factor"
+        hint = "correct ingest.csv.columns.gyro_x.unit (gyro_y, gyro_z), or that of time"
+        raise IngestError(f"{seen}: {what}", table.path, code="implausible_rate", hint=hint)
 
 
 @dataclass(frozen=True)
@@ -491,7 +499,7 @@ def declared_scale(table: Log) -> tuple[float, str] | None:
     moves = moves_of(force, rate, time_s)
     if len(moves) < MIN_MEDIAN_MOVES:
         return None
-    scales = (1.0, DEGREES, 1 / DEGREES)
+    scales = (1.0, DEGREES, 1 / DEGREES, *RANGE_FACTORS)
     misfits = misfit_deg(moves, scales)
     best = int(np.argmin(misfits))
     if misfits[0] < FAILS_DEG or misfits[best] > FITS_DEG:

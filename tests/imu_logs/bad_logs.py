@@ -343,6 +343,11 @@ def cases() -> dict[str, Case]:
             fault="implausible_rate",
             says="look like rad/s that were declared as deg/s",
         ),
+        "28 full-scale range": one(
+            scaled(slice(4, 7), 0.5),
+            fault="implausible_rate",
+            says="multiplied by 2 .* another full-scale range than declared, or the times are wrong",
+        ),
         "28 rad/s by the table": one(
             table(np.column_stack([VALUES[:, :4], VALUES[:, 4:] * np.pi / 180]), table_rate_dps=RATE),
             fault="implausible_rate",
@@ -551,7 +556,7 @@ INPUTS = {  # what each number is; docs/bad_inputs.md lists what happens
     "25": "0x1F, 1,000.5, a dash for a minus sign, numbers in quotes",
     "26": "a unit of the profile is missing or unknown",
     "27": "the header states another unit than the profile",
-    "28": "force or rate of another unit; readings beyond 1.2 times full scale",
+    "28": "force or rate of another unit or full-scale range; readings beyond 1.2 times full scale",
     "29": "no time column",
     "30": "times of another unit",
     "31": "ns since 1970, stored as doubles",
