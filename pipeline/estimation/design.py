@@ -78,7 +78,7 @@ class EffectColumns:
     def regressors(self, sensor: str, motion: Motion, K: Values, everything: Motion | None = None) -> Values:
         """Return the columns in the shape of the layout; ``everything``: the motion after all effects of timing."""
         if everything is not None and self.effect.moves and np.any(self.values):
-            slope = self.effect.slope(sensor, everything)
+            slope = self.effect.slope(sensor, everything, self.values)
             if slope is not None:
                 return (slope @ K.T)[:, :, None]
         of = self.effect.columns if self.full else self.effect.regressors

@@ -131,8 +131,8 @@ class Effect(abc.ABC):
         """Return the motion that acts on the sensor at the time stamps; only effects of timing change it."""
         return motion
 
-    def slope(self, sensor: str, moved: Motion) -> Values | None:
-        """Return du/dp of an effect of timing with one parameter p, from the moved motion; None for other effects."""
+    def slope(self, sensor: str, moved: Motion, values: Values) -> Values | None:
+        """Return du/dp of an effect of timing with one parameter p, from the motion that it moved; None for others."""
         return None
 
     @property

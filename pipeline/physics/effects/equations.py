@@ -80,7 +80,8 @@ STARTS_S = (60.0, 180.0, 500.0, 1500.0)  # from a part of some grams to a box of
 MIN_WARM_UP_S, MAX_WARM_UP_S = 1.0, 1e5  # a shorter warm-up is a step at the start, a longer one a drift
 START_LAG_S = 0.005  # not 0, where a lag and a time offset have the same column; below the lag of a 30 Hz filter
 PPM = 1e-6  # one part in a million
-DIFFERENCE_STEP_S = 1e-5  # of the central difference: its rounding is 1e-11 of u per second
+# of a difference: its rounding is 1e-10 of u per second, and its error 1e-4 of the slope where u bends, behind 5 ms
+DIFFERENCE_STEP_S = 1e-6
 OTHER_PREFIX = "other_"  # prefix of the names of free curves
 BEND = ":bend"  # suffix of the name of the second form; answers state it under the name of the first
 BEND_WIDTHS = np.geomspace(0.1, 0.5, 12)  # of a bend, shares of the span: sharper ones are steps, wider ones parabolas
@@ -287,7 +288,7 @@ class _Timing(DeclaredEffect):
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return K times the derivative of the truth with respect to the only parameter."""
-        slope = self.slope(sensor, self.moved(motion, values))
+        slope = self.slope(sensor, self.moved(motion, values), values)
         assert slope is not None  # noqa: S101
         return np.asarray(slope @ K.T)[:, :, None]
 
@@ -302,7 +303,7 @@ class TimeOffset(_Timing):
 
     nonlinear = ("tau",)
 
-    def slope(self, sensor: str, moved: Motion) -> Values:
+    def slope(self, sensor: str, moved: Motion, values: Values) -> Values:
         """Return ``du/dt``."""
         return truth_rate(sensor, moved)
 
@@ -317,7 +318,7 @@ class ClockRate(_Timing):
     needs_clock = True
     nonlinear = ("e",)
 
-    def slope(self, sensor: str, moved: Motion) -> Values:
+    def slope(self, sensor: str, moved: Motion, values: Values) -> Values:
         """Return ``1e-6 t du/dt``."""
         return PPM * moved.time[:, None] * truth_rate(sensor, moved)
 
@@ -339,18 +340,15 @@ class LowPassLag(_Timing):
         """Return ``values + step``, not below zero."""
         return np.maximum(values + step, 0.0)
 
-    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return ``K du'/dtau``: ``-K du/dt`` at a lag of 0, else a central difference."""
+    def slope(self, sensor: str, moved: Motion, values: Values) -> Values:
+        """Return ``du'/dtau``: ``-du/dt`` at a lag of 0, else a difference."""
         if values[0] <= DIFFERENCE_STEP_S:
-            slope = -truth_rate(sensor, motion)
-        else:
-            moved = (self.moved(motion, values + d) for d in (DIFFERENCE_STEP_S, -DIFFERENCE_STEP_S))
-            later, sooner = (truth(sensor, at) for at in moved)
-            slope = (later - sooner) / (2.0 * DIFFERENCE_STEP_S)
-        return np.asarray(slope @ K.T)[:, :, None]
+            return -truth_rate(sensor, moved)
+        later = self.moved(moved, values + DIFFERENCE_STEP_S)
+        return (truth(sensor, later) - truth(sensor, moved)) / DIFFERENCE_STEP_S
 
     def moved(self, motion: Motion, values: Values) -> Motion:
-        """Return the motion behind a first-order lag."""
+        """Return the motion behind a first-order lag, which replaces another one."""
         if values[0] <= 0.0:
             return motion
         if motion.at_lag is not None:
@@ -362,7 +360,11 @@ class LowPassLag(_Timing):
             return np.asarray(sum(w * getattr(n, name) for w, n in zip(WEIGHTS, nodes, strict=True)))
 
         means: dict[str, Any] = {name: partial(mean, name) for name in names}
-        return motion.changed(**means, at_offset=lambda offset=0.0: self.moved(shifted(motion, offset), values))
+
+        def at(offset: float | Values = 0.0, lag: float = float(values[0])) -> Motion:
+            return self.moved(shifted(motion, offset), np.array([lag]))
+
+        return motion.changed(**means, at_offset=at, at_lag=at)
 
 
 class FreeCurve(Effect):
