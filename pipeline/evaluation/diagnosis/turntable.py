@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -172,19 +173,25 @@ def findings(case: DiagnosisInput) -> Findings:
     Held-out motion and limits distinguish sets that the turns do not. Where a selected effect raises the held-out
     error, another set that explains as much and raises none takes the place of the selection; where one is beyond its
     limits, another one that is plausible and better by a delta BIC of ``MIN_DELTA_BIC``, which the search had missed.
+    Neither this nor the probability of whole sets changes a selection that leaves twice the noise: no set explains the
+    turns then, and the likelihoods of sets differ by far more than any effect of the sensor explains.
     Raises ``NotObservableError`` if the recordings do not determine bias and matrix.
     """
     observations = observe(case.sensor, case.recordings, case.settings.table)
     known = case.noise, case.data_sheet, case.calibration
     first = select(observations, case.configured, *known, accelerometer=case.accelerometer)
 
+    far_above_noise = (_over_noise(first.fit, case, observations) or 0.0) > FAR_ABOVE
+
     def found_by(selected: Selection, harmful: Mapping[str, str]) -> tuple[Selection, Findings]:
-        selection = completed(selected, lambda each: hidden_in(each, case.modelled))
+        hidden = partial(hidden_in, modelled=case.modelled)
+        selection = selected if far_above_noise else completed(selected, hidden)
         return selection, _found(selection, case, harmful)
 
     selection, found = found_by(first, {})
     beyond = [] if case.data_sheet.accept_implausible else implausible(found)
-    second = selection.without({*found.harmful, *beyond}) if found.harmful or beyond else None
+    doubted = {*found.harmful, *beyond}
+    second = selection.without(doubted) if doubted and not far_above_noise else None
     if second is None or (beyond and second.bic < selection.bic + MIN_DELTA_BIC):
         return found
     _, other = found_by(second, found.harmful)
