@@ -53,7 +53,7 @@ from imu_logs.text_read import SHORTEST_PART
 from imu_logs.units import COUNTS, FORCE_UNITS, GYROSCOPE, TABLE_CHANNELS, TRIADS, UNITS
 
 UNITS_OF = {"accelerometer": ("g", "mg", "ug", "m/s^2", "mm/s^2"), "gyroscope": ("deg/s", "mdps", "rad/s", "mrad/s")}
-LEAST_GRAVITY = 0.3  # of gravity, for the median |a| of a log; quality_flags refuses less
+LEAST_GRAVITY = 0.3  # of gravity, for the median |a| of a log that holds gravity
 MOST_NAMED = 6  # columns in a remark
 FEWEST_LABELS, MOST_LABELS = 3, 4  # two texts may be states of the logger; labels that a remark names
 SAME_UNIT = 0.2  # relative: a low-cost sensor in few positions, and moves by hand
@@ -466,7 +466,8 @@ def _without_gravity(log: UnknownLog, triad: tuple[int, int, int], unit: str) ->
     if size > LEAST_GRAVITY * FORCE_UNITS.get(unit, 0.0) and not (unit == TO_DECIDE and size < LARGEST_LINEAR):
         return ""
     return (
-        f"|a| is {size:.3g} {unit.removeprefix(TO_DECIDE)} on the whole: acceleration without gravity, which "
+        f"|a| is {size:.3g} {unit.removeprefix(TO_DECIDE)}".rstrip()
+        + " on the whole: acceleration without gravity, which "
         "calibrates nothing; take the columns or the file with gravity (TotalAcceleration beside Accelerometer, Acc "
         "beside FreeAcc)"
     )

@@ -1,6 +1,6 @@
 """A figure of the evidence: a measured share or quantity with its interval and goal, and the file of such figures.
 
-Every command that measures evidence (``benchmarks/evidence.yaml``) writes its figures with ``write_figures``.
+Every command that measures evidence (``benchmarks/evidence/measures.yaml``) writes its figures with ``write_figures``.
 """
 
 from __future__ import annotations

@@ -65,8 +65,31 @@ def test_effects_that_one_run_had_are_kept_by_the_command_that_adds_more() -> No
     assert command[:8] == ["-m", "pipeline", "add", "my bench", "U1", "gyroscope.a", "gyroscope.b", "gyroscope.c"]
     assert command[8:11] == ["--results", "/out", "--config"]
     assert parse_config(command[11:]) == {"unit_overrides": {"U2": ["filter.order=3"], "U1": ["filter.order=1"]}}
-    once = words(once_command(settings, "U1", "effects.gyroscope=[a,b,c]"))
+    once = words(once_command(settings, "U1", ["effects.gyroscope=[a,b,c]"]))
     assert parse_config(once[3:])["unit_overrides"]["U1"] == ["filter.order=1", "effects.gyroscope=[a,b,c]"]
+    settings["unit_overrides"] = {"U1": ["effects.gyroscope=auto"]}
+    command = words(add_command(settings, "U1", ["gyroscope.c"]))
+    assert command[3:] == ["my bench", "U1", "gyroscope.c"]
+
+
+def test_where_an_override_of_all_units_sets_the_effects_the_command_is_for_one_run() -> None:
+    settings = {
+        "campaign": "c",
+        "overrides": ["filter.order=1", "effects.gyroscope=[a]"],
+        "unit_overrides": {"U1": ["effects.accelerometer=[d]"]},
+    }
+    command = words(add_command(settings, "U1", ["gyroscope.c", "accelerometer.e"]))
+    own = {"U1": ["effects.accelerometer=[d,e]", "effects.gyroscope=[a,c]"]}
+    assert parse_config(command[3:]) == settings | {"unit_overrides": own}
+    alone = words(add_command(settings, "U2", ["accelerometer.e"]))
+    assert alone[:6] == ["-m", "pipeline", "add", "c", "U2", "accelerometer.e"]
+
+
+def test_a_setting_of_zero_stays_in_the_command() -> None:
+    assert words(run_command({"campaign": "c", "publish_limit": 0, "lot": None}))[3:] == [
+        "campaign=c",
+        "publish_limit=0",
+    ]
 
 
 @pytest.mark.parametrize(

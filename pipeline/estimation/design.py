@@ -256,6 +256,7 @@ class Design:
         """Return the design of the same rows with other weights."""
         found, blocks, weight = copy(self), observations.blocks, observations.weight
         found.columns = Products(blocks, weight, self.columns.columns)
+        found.size = np.sqrt(np.einsum("i,ij,ij->j", weight, found.columns.columns, found.columns.columns))
         return found
 
     def _errors_of_stops(self, observations: Observations, terms: Terms, K: Values) -> list[scipy.sparse.csr_array]:

@@ -163,9 +163,9 @@ def information(noise: Noise | None, interval: float) -> float:
 
 
 def constant_bias_s(noise: Noise | None, interval: float) -> float:
-    """Return the time over which a bias is assumed constant, s: L with ``2 q L^2 / (pi^2 tau) = SLOW dt``.
+    """Return the time over which a bias is assumed constant, s: L with ``2 q L^2 / (pi^2 tau) = S dt``.
 
-    At the frequency 1 / (2 L) its spectrum, ``2 q tau / (2 pi f tau)^2``, is ``SLOW_SPECTRUM_SHARE`` times that of
+    At the frequency 1 / (2 L) its spectrum, ``2 q tau / (2 pi f tau)^2``, is S = ``SLOW_SPECTRUM_SHARE`` times that of
     white noise, dt. At higher frequencies white noise is larger still. Without a static recording that shows slow
     wander, L is infinite. ``interval``: s, dt.
     """

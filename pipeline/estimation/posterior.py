@@ -61,7 +61,7 @@ BEAM_LOG_EVIDENCE = 12.0  # of log E below the best, beyond which a set of the b
 EXTENDED_LOG_EVIDENCE = 7.0
 # number of these sets; iterations of the search for the best scales, and of exchanges
 MOST_NEAR, SCALE_SEARCH_ITERATIONS = 16, 3
-CERTAIN = 0.97  # largest stated probability: of the inclusions with 1.000, 96.6 % were right in those sensors
+CERTAIN = 0.97  # largest stated probability: of the inclusions with 1.000, 96.6 % were right in 738 sensors
 ANSWER_SET_PROBABILITY = 0.95  # probability of an answer set
 UPPER_LIMIT_SHARE = 29.0 / 30.0  # of an upper limit, see above: that of 0.95 was above the truth in 103 of 116
 LIMIT_SET_SHARE = 0.05  # share of the best probability, above which a set is used for upper limits
@@ -93,7 +93,7 @@ class Answers:
         return float(sum(weight for names, weight in self.sets if name in names))
 
     def answer_set(self) -> list[tuple[tuple[str, ...], float]]:
-        """Return the smallest number of sets with 95 % of the probability."""
+        """Return the fewest sets that have 95 % of the probability together."""
         total = np.cumsum([weight for _, weight in self.sets])
         return self.sets[: int(np.searchsorted(total, ANSWER_SET_PROBABILITY * total[-1])) + 1]
 

@@ -161,7 +161,10 @@ class Selection:
             part.moved.clear()
 
     def without(self, names: Collection[str]) -> Selection | None:
-        """Return the selection by the other candidates; None where their 2 log L is less by ``MIN_DELTA_BIC``."""
+        """Return the selection by the other candidates; None without one, or where its 2 log L is clearly less.
+
+        2 log L may be less by ``MIN_DELTA_BIC``.
+        """
         others = {name: term for name, term in self.candidates.items() if name not in names}
         found = replace(self, steps={}, fits=dict(self.fits), fit=self.base, ranking=self.first, candidates=others)
         found.run()
@@ -276,9 +279,9 @@ class Selection:
         if not values:
             return None
         best = max(values, key=lambda name: values[name])
-        if best == DELAYS[1] and values.get(DELAYS[0], 0.0) > values[best] - STRONG_DELTA_BIC:
+        if best == DELAYS[1] and values.get(DELAYS[0], -np.inf) > values[best] - STRONG_DELTA_BIC:
             best = DELAYS[0]
-        tied = [name for name in self.candidates if values.get(name, 0.0) > values[best] - TIE]
+        tied = [name for name in self.candidates if values.get(name, -np.inf) > values[best] - TIE]
         name = best if best in DELAYS else tied[0]
         return next(s for s in scores if s.name == name)
 
@@ -396,7 +399,10 @@ class Selection:
         return 2.0 * log_likelihood - count * float(np.log(self.ranking.samples))
 
     def _exchange(self) -> bool:
-        """Try to replace a selected effect by another one that explains significantly more; return whether one does."""
+        """Replace a selected effect by another one that explains significantly more, if it is determined.
+
+        Returns whether one explains more: it was taken, or is refused from now on.
+        """
         for name in [n for n in self.names if not effect(n).moves]:
             others = [n for n in self.names if n != name]
             scores = self._given(others)
@@ -448,6 +454,7 @@ class Selection:
         able = [j for j, place in enumerate(ranking.places) if len(place)]
         names = [candidate.effect.name for candidate in ranking.candidates]
         pairs = [(j, k) for j, k in combinations(able, 2) if names[j] != names[k]]
+        pairs = [(j, k) for j, k in pairs if {names[j], names[k]} != {*DELAYS} and not overlaps(names[j], [names[k]])]
         best: tuple[float, int, int] = (2.0 * MIN_DELTA_BIC, -1, -1)
         for members in by_size(len(ranking.places[j]) + len(ranking.places[k]) for j, k in pairs):
             alike = [pairs[m] for m in members]

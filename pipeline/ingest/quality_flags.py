@@ -6,8 +6,8 @@ always a wrong unit or column. ``pipeline.checks.mounting`` checks the mounting.
 
 A reading is *stuck* where it is constant for longer than noise allows. The share ``p`` of equal neighbours in windows
 of 64 samples measures the noise of the channel. A run of ``L`` equal values among ``n`` is expected ``n p^(L-1)`` times
-by chance, and flagged if that is below 10^-6. If the 95th percentile of ``p`` exceeds one half, the noise is below the
-resolution, and no run is flagged.
+by chance, with the 95th percentile of ``p``, and flagged if that is below 10^-6. If this percentile exceeds one half,
+the noise is below the resolution, and no run is flagged.
 
 The unit of the angular rates follows from the rotation of gravity between rests. In the sensor's axes,
 
@@ -49,6 +49,8 @@ FEWEST_STEPS = 64  # of the resolution: a channel with a smaller span shows nois
 EQUAL_NEIGHBOUR_SHARE = 0.5  # share of equal neighbours at which noise is below the resolution
 MAX_NOTED_STRETCHES = 10  # of stuck rows that have a note each; more are one note: ``check`` lists 20 notes of a file
 DEAD_ROWS = 1000  # shorter recordings may be constant by their resolution
+NEAR = 0.7  # of a factor between two units; other units differ by more than its square
+LEAST_COUNTS = 1500.0  # g: more than any unit in place of another, with half a turn of counts in 12 bits: 2048 at 1 g
 FORCE_RANGE_G = (0.3, 3.0)  # about 1 g at rest; another unit is wrong by a factor of 9.8 or 1000
 QUATERNION_TOLERANCE = 0.01  # components rounded to two decimals
 RATE_TOLERANCE = 0.2  # another unit of time is wrong by a factor of 1000
@@ -57,7 +59,7 @@ MEDIAN_SAMPLES = 200_000  # samples that a median is taken of
 # product specification 3.1). Where a log is coarse, a rest repeats such a reading although it is not clipped.
 REST_LIMITS = {"accelerometer": 1.2, "gyroscope": 20.0}
 TURNING_DPS = 5.0  # a smaller rate is of the size of a low-cost gyroscope's bias
-# Factors by which intervals are wrong, and the kind of times that this indicates.
+# Factors that would make wrong intervals right, and the kind of times that this indicates.
 _OTHER_FACTORS = {
     1e-3: "times of a unit a thousand times shorter", 1e3: "times of a unit a thousand times longer",
     1e-6: "times of a unit a million times shorter", 1e6: "times of a unit a million times longer", 1e-9: "ns",
@@ -156,7 +158,7 @@ def flag_flat_tops(table: Log, sensor: str, flags: NDArray[np.uint16]) -> list[N
     """Flag readings that repeat the largest or the smallest value of their channel more often than noise allows.
 
     The range of such a sensor or logger is smaller than is stated. k repetitions are expected ``n p^k`` times by
-    chance, with p as for stuck readings, of the other values. An end that a sensor may read at rest is none. Logs with
+    chance, with p as for stuck readings, of the other values. A value that a sensor may read at rest is no such end. Logs with
     the motion of a table are not searched: a table may keep its largest rate, and its log contradicts a clipped
     reading.
     """
@@ -346,11 +348,12 @@ def _check_force(table: Log) -> None:
     low, high = FORCE_RANGE_G
     if low <= usual <= high:
         return
-    hint = "is the unit or the scale right?"
-    for unit, factor in (*FORCE_UNITS.items(), ("g that were declared as m/s^2", 1.0 / STANDARD_GRAVITY)):
-        if 0.7 < usual / factor < 1.4:
-            hint = f"the numbers look like {unit}"
-    if usual > 1500.0:
+    pairs = itertools.permutations(FORCE_UNITS.items(), 2)
+    alike = [
+        f"{unit} declared as {stated}" for (unit, own), (stated, of) in pairs if NEAR < usual * of / own < 1 / NEAR
+    ]
+    hint = f"the numbers look like {' or '.join(alike)}" if alike else "is the unit or the scale right?"
+    if usual > LEAST_COUNTS:
         hint = "the numbers look like raw counts, which need counts_per_unit"
     message = f"median specific force is {usual:.4g} g, and a log of rests and turns has about 1 g (allowed {low} to"
     message += f" {high}): {hint}; correct ingest.csv.columns.accel_x.unit (accel_y, accel_z)"
@@ -372,7 +375,7 @@ def _check_attitude(table: Log) -> None:
 def _check_turn_rate(table: Log) -> None:
     """Raise ``IngestError`` if rates differ by a factor of 180/pi from the table's, or from gravity's rotation.
 
-    Where no table is logged, also if they differ from gravity's rotation by the factor of another full-scale range.
+    Without a table's angle or rate, also if they differ from gravity's rotation by the factor of another full-scale range.
     """
     if "gyro_x" not in table.values:
         return
@@ -391,7 +394,7 @@ def _check_turn_rate(table: Log) -> None:
             return
         ratio, seen = found
     for factor, what in ((1 / DEGREES, "rad/s that were declared as deg/s"), (DEGREES, "deg/s declared as rad/s")):
-        if 0.7 < ratio / factor < 1.4:
+        if NEAR < ratio / factor < 1 / NEAR:
             hint = "correct ingest.csv.columns.gyro_x.unit (gyro_y, gyro_z)"
             raise IngestError(f"{seen}: the numbers look like {what}", table.path, code="implausible_rate", hint=hint)
     if not {"table_angle", "table_rate"} & table.values.keys():

@@ -114,7 +114,7 @@ def read_recordings(
         refused.insert(0, MissingInputError(message, str(folder)))
     if refused:
         raise _together(refused)
-    if left_out:
+    if left_out and recordings:
         note = Note("N-NOTREAD", len(left_out), 0, 0, "; ".join(left_out))
         recordings[0] = replace(recordings[0], notes=(*recordings[0].notes, note))
     _check_different(recordings)

@@ -45,7 +45,8 @@ NAMED_MISSING = 10  # units with a missing effect that the last lines name
 SMALLEST_CHANGE = 0.02  # relative change of an error that is reported
 PLAIN_YAML_TEXT = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that need no quotes in YAML, also within brackets
 NOT_TEXT = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}  # words that YAML reads as another type
-EFFECTS_OVERRIDE = re.compile(r"effects\.(accelerometer|gyroscope)=\[(.*)\]")
+UNSET: tuple[Any, ...] = (None, "", [], {})  # values of settings that a command leaves out
+EFFECTS_OVERRIDE = re.compile(r"effects\.(accelerometer|gyroscope)=(?:\[(.*)\]|.*)")
 OPEN = "effects that the recordings leave open (explain names them)"
 NOT_CONVERGED = "the fit did not converge: parameters and uncertainties are in doubt"
 DEFAULT_RESULTS = "results"  # the default folder of results
@@ -158,7 +159,7 @@ def commands_of(
         return {}
     effects = [f"{sensor}.{name}" for name in part["selected"]]
     verb = "add" if part["verdict"] == Verdict.MISSING_EFFECT else "try"
-    them, once = "it" if len(effects) == 1 else "them", once_command(settings, unit, part["override"], results)
+    them, once = "it" if len(effects) == 1 else "them", once_command(settings, unit, [part["override"]], results)
     return {"verb": f"{verb} {them}", "add": add_command(settings, unit, effects, results), "once": once}
 
 
@@ -345,26 +346,38 @@ def apply_command(settings: Mapping[str, Any], unit: str) -> str:
 def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], results: str = DEFAULT_RESULTS) -> str:
     """Return the command that adds effects (``sensor.effect``) to the file of a unit and runs the campaign.
 
-    It also adds the effects that ``unit_overrides`` sets for this run, because that override has precedence.
+    It also adds the effects that ``unit_overrides`` sets for this run, because that override has precedence. Where
+    ``overrides`` sets those of all units, the file has no effect: then it is ``once_command`` with the unit's effects.
     """
-    overrides = dict(settings.get("unit_overrides") or {})
-    others, given = [], []
-    for override in overrides.pop(unit, []):
-        if match := EFFECTS_OVERRIDE.fullmatch(override):
-            given += [f"{match[1]}.{name.strip()}" for name in match[2].split(",") if name.strip()]
-        else:
-            others.append(override)
-    overrides |= {unit: others} if others else {}
-    rest = {**settings, "unit_overrides": overrides}
-    return _command("add", rest, [unit, *dict.fromkeys([*given, *effects])], results)
+    of_units = dict(settings.get("unit_overrides") or {})
+    own, sensors = of_units.pop(unit, []), {effect.partition(".")[0] for effect in effects}
+    wanted, of_all = _effects_of(own), _effects_of(settings.get("overrides") or ())
+    stronger = bool(sensors & of_all.keys())
+    if stronger:
+        wanted = of_all | wanted
+    for sensor, _, name in (effect.partition(".") for effect in effects):
+        wanted[sensor] = [*dict.fromkeys([*wanted.get(sensor, ()), name])]
+    if stronger:
+        return once_command(settings, unit, [f"effects.{s}=[{','.join(wanted[s])}]" for s in sorted(sensors)], results)
+    others = [override for override in own if not EFFECTS_OVERRIDE.fullmatch(override)]
+    of_units |= {unit: others} if others else {}
+    named = [f"{sensor}.{name}" for sensor, names in wanted.items() for name in names]
+    return _command("add", {**settings, "unit_overrides": of_units}, [unit, *named], results)
 
 
-def once_command(settings: Mapping[str, Any], unit: str, override: str, results: str = DEFAULT_RESULTS) -> str:
-    """Return the command that runs the campaign once with one more override of a unit."""
-    overrides = settings.get("unit_overrides") or {}
-    key = override.partition("=")[0]
-    others = [text for text in overrides.get(unit, []) if text.partition("=")[0] != key]
-    once = {**settings, "unit_overrides": {**overrides, unit: [*others, override]}}
+def _effects_of(overrides: Iterable[str]) -> dict[str, list[str]]:
+    """Return the effects that overrides set, by sensor; none for ``auto``."""
+    found = [match for text in overrides if (match := EFFECTS_OVERRIDE.fullmatch(text))]
+    return {m[1]: [name.strip() for name in (m[2] or "").split(",") if name.strip()] for m in found}
+
+
+def once_command(
+    settings: Mapping[str, Any], unit: str, overrides: Sequence[str], results: str = DEFAULT_RESULTS
+) -> str:
+    """Return the command that runs the campaign once with further overrides of a unit."""
+    of_units, keys = settings.get("unit_overrides") or {}, {override.partition("=")[0] for override in overrides}
+    others = [text for text in of_units.get(unit, []) if text.partition("=")[0] not in keys]
+    once = {**settings, "unit_overrides": {**of_units, unit: [*others, *overrides]}}
     return run_command(once | ({"results": results} if results != DEFAULT_RESULTS else {}))
 
 
@@ -380,7 +393,7 @@ def _program() -> list[str]:
 
 
 def _config(settings: Mapping[str, Any]) -> list[str]:
-    pairs = [f"{key}={_flow(value, top=True)}" for key, value in settings.items() if value]
+    pairs = [f"{key}={_flow(value, top=True)}" for key, value in settings.items() if value not in UNSET]
     return ["--config", *pairs] if pairs else []
 
 

@@ -1,6 +1,6 @@
 """Stage gather: publish the files of all units, the summary and the page of the campaign.
 
-It joins the files of the stage ``summary``, one for each batch, and reads no other document of a unit. The complete set
+It joins the files of the stage ``summary``, one for each batch, and reads no documents of all units. The complete set
 is written to a new folder, which then replaces the published one: the published files are always from one run.
 """
 
@@ -216,7 +216,7 @@ def publish_histories(new: Path, entries: Sequence[JSON], units: Iterable[str]) 
 def same_files(recordings: Mapping[str, Mapping[str, str]]) -> list[tuple[list[str], list[list[str]]]]:
     """Return groups of units that have files with the same content under different names, and these files.
 
-    ``recordings``: unit to its files, each with a digest. A file that several units use under one name is not reported.
+    ``recordings``: unit to its files, each with a digest. Of the units that use a file under one name, the first.
     """
     first: dict[str, tuple[str, str]] = {}
     same: dict[str, dict[str, str]] = {}

@@ -69,7 +69,8 @@ SMALLEST_STEP = 1e-13  # g or deg/s: rounding
 COMPARED_STEP = 0.1  # the same where log L alone is compared, which is then within 0.005 a parameter of its maximum
 STALLED = 0.1  # of a standard uncertainty: a fit whose steps stay larger has not converged
 SAME_SCALE = 1e-4  # relative change of the noise's scale below which the weight of the prior is not changed
-UNDETERMINED_COLUMN_SHARE = 1e-8  # share of its columns below which a combination of parameters is not determined
+# share of the largest eigenvalue of the products of unit columns, below which a combination of them is not determined
+UNDETERMINED_COLUMN_SHARE = 1e-8
 SCATTER_FACTORS = (3.0**0.5, 3.0**0.25, 3.0**0.125)  # factors of a scatter, on the way to its maximum
 SHARP = 0.5  # standard deviation of a scatter's logarithm, half a step of the grid
 MIN_TIMES_OF_BIAS = 20.0  # T / tau: with T / (2 tau) independent values a variance is known to sqrt(4 tau / T), 45 %
@@ -537,7 +538,7 @@ def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, value
 
 
 def plausible(fitted: FitByHand, limits: Limits) -> bool:
-    """Return whether every effect is within its limits, or exceeds them by less than its uncertainty."""
+    """Return whether every effect is within its limits, or exceeds them by less than twice its standard uncertainty."""
     found = estimates(fitted.state.terms, fitted.covariance).items()
     return all(within(*of_effect, limits.get(name, np.inf)) for name, of_effect in found)
 

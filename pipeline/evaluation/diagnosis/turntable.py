@@ -49,7 +49,7 @@ from pipeline.evaluation.held_out.samples import HeldOutCase
 from pipeline.evaluation.held_out.validation import noise_floor, vector_noise_floor
 from pipeline.physics.effects import catalogue
 
-MOST_OF = 0.5  # share of the gain that the listed seconds have together
+MOST_OF = 0.5  # share of the gain that the seconds have together, of which the largest stretches are listed
 MAX_INFLUENTIAL_STRETCHES = 5  # that a page lists
 DETERMINED = 1e-6  # least information on an effect's weakest direction, over that of all recordings
 NEEDED_RECORDING = "record turns about all three axes on a table whose angle and rate are logged"
@@ -149,7 +149,9 @@ def _refitted(fit: JointFit, index: Index, least: float, products: Values, rest:
 
 
 def _stretches(observations: Observations, shares: Values, of_block: Index) -> list[JSON]:
-    """Return the fewest seconds that have half of the gain, adjacent blocks of a recording joined, largest first."""
+    """Return the fewest seconds that have half of the gain, adjacent blocks of a recording joined: the five largest."""
+    if not shares.any():
+        return []
     order = np.argsort(-shares)
     chosen = np.sort(order[: int(np.searchsorted(np.cumsum(shares[order]), MOST_OF)) + 1])
     time = np.concatenate([part.motion.time for part in observations.parts])
@@ -271,7 +273,8 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         if verdict == Verdict.UNEXPLAINED:
             return FAR_OFF
         if one_way(observations):
-            return "make every turn in the other direction too: five effects are observable only in both directions"
+            both = [plain(n) for n, e in catalogue().items() if e.needs_both_directions and sensor in e.sensors]
+            return f"make every turn in the other direction too: only both directions show {', '.join(both)}"
         proposed = next((this for name, this in catalogue().items() if this.proposed and name in hidden), None)
         return f"to make {plain(proposed.name)} observable: record {proposed.excitation}" if proposed else ""
 
