@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from imu_logs.clocks import bursts_error, rounded_error
 from imu_logs.log import Log
 from imu_logs.profile import Checks
-from imu_logs.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TABLE_CHANNELS, TRIADS
+from imu_logs.units import ATTITUDE, DEGREES, FORCE_UNITS, TABLE_CHANNELS, TRIADS
 from pipeline.core.errors import IngestError
 from pipeline.core.records import SENSOR_UNITS, Index, Integers, Mask, Note, Recording, Values, median
 from pipeline.core.settings import Sensor
@@ -50,7 +50,7 @@ EQUAL_NEIGHBOUR_SHARE = 0.5  # share of equal neighbours at which noise is below
 MAX_NOTED_STRETCHES = 10  # of stuck rows that have a note each; more are one note: ``check`` lists 20 notes of a file
 DEAD_ROWS = 1000  # shorter recordings may be constant by their resolution
 NEAR = 0.7  # of a factor between two units; other units differ by more than its square
-LEAST_COUNTS = 1500.0  # g: more than any unit in place of another, with half a turn of counts in 12 bits: 2048 at 1 g
+LEAST_COUNTS = 1500.0  # g: accelerometers have 2048 counts per g and more
 FORCE_RANGE_G = (0.3, 3.0)  # about 1 g at rest; another unit is wrong by a factor of 9.8 or 1000
 QUATERNION_TOLERANCE = 0.01  # components rounded to two decimals
 RATE_TOLERANCE = 0.2  # another unit of time is wrong by a factor of 1000
@@ -158,9 +158,9 @@ def flag_flat_tops(table: Log, sensor: str, flags: NDArray[np.uint16]) -> list[N
     """Flag readings that repeat the largest or the smallest value of their channel more often than noise allows.
 
     The range of such a sensor or logger is smaller than is stated. k repetitions are expected ``n p^k`` times by
-    chance, with p as for stuck readings, of the other values. A value that a sensor may read at rest is no such end. Logs with
-    the motion of a table are not searched: a table may keep its largest rate, and its log contradicts a clipped
-    reading.
+    chance, with p as for stuck readings, of the other values. A value that a sensor may read at rest is no such end.
+    Logs with the motion of a table are not searched: a table may keep its largest rate, and its log contradicts a
+    clipped reading.
     """
     notes: list[Note] = []
     if set(TABLE_CHANNELS) & table.values.keys():
@@ -348,10 +348,8 @@ def _check_force(table: Log) -> None:
     low, high = FORCE_RANGE_G
     if low <= usual <= high:
         return
-    pairs = itertools.permutations(FORCE_UNITS.items(), 2)
-    alike = [
-        f"{unit} declared as {stated}" for (unit, own), (stated, of) in pairs if NEAR < usual * of / own < 1 / NEAR
-    ]
+    pairs, near = itertools.permutations(FORCE_UNITS.items(), 2), 1.0 / NEAR
+    alike = [f"{unit} declared as {stated}" for (unit, own), (stated, of) in pairs if NEAR < usual * of / own < near]
     hint = f"the numbers look like {' or '.join(alike)}" if alike else "is the unit or the scale right?"
     if usual > LEAST_COUNTS:
         hint = "the numbers look like raw counts, which need counts_per_unit"
@@ -375,7 +373,7 @@ def _check_attitude(table: Log) -> None:
 def _check_turn_rate(table: Log) -> None:
     """Raise ``IngestError`` if rates differ by a factor of 180/pi from the table's, or from gravity's rotation.
 
-    Without a table's angle or rate, also if they differ from gravity's rotation by the factor of another full-scale range.
+    Without a table's angle or rate, also if they differ from gravity's rotation by that of another full-scale range.
     """
     if "gyro_x" not in table.values:
         return
@@ -505,7 +503,7 @@ def declared_scale(table: Log) -> tuple[float, str] | None:
     scales = (1.0, DEGREES, 1 / DEGREES, *RANGE_FACTORS)
     misfits = misfit_deg(moves, scales)
     best = int(np.argmin(misfits))
-    if misfits[0] < FAILS_DEG or misfits[best] > FITS_DEG:
+    if misfits[0] < SMALLEST_TURN_DEG or misfits[best] > min(FITS_DEG, 0.5 * misfits[0]):
         return None
     return 1 / scales[best], (
         f"in {len(moves)} moves between rests gravity turns by the angle of the rates if they are multiplied by "
