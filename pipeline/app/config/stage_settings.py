@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,8 +27,6 @@ from pipeline.output.history import digest
 from pipeline.unit import EFFECTS_STAGE, STEPS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
     from pipeline.app.config.campaign import Campaign, UnitRow
 
 PACKAGE = Path(__file__).resolve().parents[2]

@@ -6,6 +6,7 @@ read. A job takes it from there if the pack of the earlier job has the members t
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,8 +16,6 @@ from pipeline.ingest.arrow import from_parquet, to_parquet
 from pipeline.unit import STEPS, UnitFiles
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
     from pipeline.app.steps.batch import Job
 
 Result = TypeVar("Result")
