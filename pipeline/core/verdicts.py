@@ -176,20 +176,17 @@ def error_of(held_out: Mapping[str, Any] | None) -> Error:
 
 def error_in_row(row: Mapping[str, Any], sensor: str) -> Error:
     """Return the same from a row of ``summary.csv``."""
-    for kind, prefix in (("vector", f"{sensor}_vector"), ("magnitude", sensor)):
-        floor = _number(row.get(f"{prefix}_noise_floor"))
-        if floor or kind == "magnitude":
-            before, after = _number(row.get(f"{prefix}_error_before")), _number(row.get(f"{prefix}_error_after"))
-            break
-    return Error(kind, before, after, floor)
+    by_vector = _number(row.get(f"{sensor}_vector_noise_floor"))
+    kind, prefix = ("vector", f"{sensor}_vector") if by_vector else ("magnitude", sensor)
+    return Error(kind, *(_number(row.get(f"{prefix}_{n}")) for n in ("error_before", "error_after", "noise_floor")))
 
 
 class RowState(NamedTuple):
-    """A row of ``summary.csv`` with its errors by sensor, and what keeps the unit from being ready (``kinds_of``)."""
+    """A row of ``summary.csv`` with its errors by sensor, and what keeps the unit from being ready."""
 
     row: Mapping[str, Any]
     errors: dict[str, Error]
-    kinds: dict[str, list[str]]
+    kinds: dict[str, list[str]]  # the most urgent kind first, each with the sensors concerned
 
 
 def state_of(row: Mapping[str, Any] | RowState) -> RowState:
@@ -204,11 +201,6 @@ def _number(value: Any) -> float | None:  # noqa: ANN401  (a cell: a number, a t
     if isinstance(value, str):
         value = float(value or "nan")
     return float(value) if value is not None and -math.inf < value < math.inf else None
-
-
-def kinds_of(row: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return what keeps a unit from being ready, the most urgent kind first, with the sensors concerned."""
-    return state_of(row).kinds
 
 
 def _kinds(row: Mapping[str, Any], errors: Mapping[str, Error]) -> dict[str, list[str]]:
