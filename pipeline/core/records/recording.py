@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, wraps
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 ReturnedQuantity = TypeVar("ReturnedQuantity")
 Arguments = ParamSpec("Arguments")
+OfRecording: TypeAlias = "Callable[Concatenate[Recording, Arguments], ReturnedQuantity]"
 STRAIGHT = ("+x", "+y", "+z")
 
 BETWEEN_ATTITUDES_S = 1000.0  # between the blocks of a file of attitudes, whose times are not known
@@ -205,9 +206,7 @@ class Same:
         return isinstance(other, Same) and self.value is other.value
 
 
-def once(
-    compute: Callable[Concatenate[Recording, Arguments], ReturnedQuantity],
-) -> Callable[Concatenate[Recording, Arguments], ReturnedQuantity]:
+def once(compute: OfRecording[Arguments, ReturnedQuantity]) -> OfRecording[Arguments, ReturnedQuantity]:
     """Declare a quantity of a recording: it follows from the recording and further arguments, which have a hash.
 
     The function computes it at the first call, and the recording keeps it. The steps of a unit pass on its recordings
@@ -217,17 +216,14 @@ def once(
     return _kept(compute, lambda recording: recording._quantities)  # noqa: SLF001
 
 
-def once_of_log(
-    compute: Callable[Concatenate[Recording, Arguments], ReturnedQuantity],
-) -> Callable[Concatenate[Recording, Arguments], ReturnedQuantity]:
+def once_of_log(compute: OfRecording[Arguments, ReturnedQuantity]) -> OfRecording[Arguments, ReturnedQuantity]:
     """Declare a quantity as ``once`` that depends on no readings, flags, filter or role (``with_readings``)."""
     return _kept(compute, lambda recording: recording._quantities_of_log)  # noqa: SLF001
 
 
 def _kept(
-    compute: Callable[Concatenate[Recording, Arguments], ReturnedQuantity],
-    quantities: Callable[[Recording], Quantities],
-) -> Callable[Concatenate[Recording, Arguments], ReturnedQuantity]:
+    compute: OfRecording[Arguments, ReturnedQuantity], quantities: Callable[[Recording], Quantities]
+) -> OfRecording[Arguments, ReturnedQuantity]:
     @wraps(compute)
     def quantity(recording: Recording, /, *arguments: Arguments.args, **named: Arguments.kwargs) -> ReturnedQuantity:
         key = quantity, arguments, *sorted(named.items())
