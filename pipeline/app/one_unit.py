@@ -22,7 +22,7 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from imu_logs import CANONICAL_CSV, load_profile
 from imu_logs.units import CANONICAL, SECOND_NS, SINCE_1970_NS, TRIADS
-from pipeline.app.config.campaign import Campaign, UnitRow, cut_batches
+from pipeline.app.config.campaign import Campaign, UnitRow, cut_batches, require_unit
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import as_list, key_of
 from pipeline.app.config.options import PYTHON, RUN_SETTINGS, nearest, parse
@@ -139,9 +139,7 @@ def try_unit(unit: ConfiguredUnit, until: str, *, fits: bool = True) -> tuple[Un
 
 def unit_of_campaign(campaign: Campaign, unit: str) -> ConfiguredUnit:
     """Return a unit of a campaign, as a run of the campaign configures it."""
-    if unit not in campaign.units:
-        message = f"no unit {unit!r}{nearest(str(unit), campaign.units)}"
-        raise ConfigurationError(message, str(campaign.directory / "units.csv"))
+    require_unit(unit, campaign.units, campaign.directory)
     batch = next(name for name, units in campaign.batches.items() if unit in units)
     files = UnitFiles(campaign.recorded, campaign.folder(unit))
     return ConfiguredUnit(campaign.units[unit], files, campaign.chains[batch], campaign.run_settings(unit))

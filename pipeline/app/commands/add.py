@@ -20,7 +20,7 @@ import yaml
 
 from pipeline.app.commands import add_run_options, parser_of
 from pipeline.app.commands.run import run_snakemake
-from pipeline.app.config.campaign import TAKE_OVER, find_campaign, read_layers
+from pipeline.app.config.campaign import TAKE_OVER, find_campaign, read_layers, require_unit
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import DEVICES_FOLDER, Layer, Layers, key_of
 from pipeline.app.config.options import nearest, parse
@@ -113,13 +113,12 @@ def edit_effects(
 
 def _file(unit: str, layers: Layers, directory: Path) -> Path:
     """Return the device file of a unit; the unit must exist, and its name must not be the serial of another unit."""
-    rows, units_table = layers.units_table.rows, str(directory / "units.csv")
-    if unit not in rows:
-        raise ConfigurationError(f"no unit {unit!r}{nearest(unit, rows)}", units_table)
+    rows = layers.units_table.rows
+    require_unit(unit, rows, directory)
     others = [u for u, row in rows.items() if row.get("serial") == unit and u != unit]
     if others:
         both = f"{DEVICES_FOLDER}/{unit}.yaml would concern {', '.join(others)} too, whose serial is {unit}"
-        raise ConfigurationError(f"{both}: give the unit or the serial another name", units_table)
+        raise ConfigurationError(f"{both}: give the unit or the serial another name", str(directory / "units.csv"))
     return directory / DEVICES_FOLDER / f"{unit}.yaml"
 
 

@@ -20,8 +20,7 @@ from imu_logs.guesses import TO_DECIDE
 from imu_logs.proposal import Proposal, layouts_of, not_found
 from pipeline.app.commands import parser_of
 from pipeline.app.commands.readings import Reading, campaign_of, config_of_log, recordings_of_files
-from pipeline.app.config.campaign import Campaign, find_campaign, load_campaign
-from pipeline.app.config.options import nearest
+from pipeline.app.config.campaign import Campaign, find_campaign, load_campaign, require_unit
 from pipeline.app.one_unit import try_unit, unit_of_campaign
 from pipeline.app.recording_facts import (
     SUITS_FERRARIS,
@@ -226,10 +225,7 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Outcome]]]:
             continue
         campaign = load_campaign({"campaign": str(directory)})
         known = [arguments.unit] if arguments.unit else list(campaign.units)
-        if known[0] not in campaign.units:
-            raise ConfigurationError(
-                f"no unit {known[0]!r}{nearest(known[0], campaign.units)}", str(directory / "units.csv")
-            )
+        require_unit(known[0], campaign.units, directory)
         chosen, others = recordings_of_files(files, campaign, known) if files else ({unit: [] for unit in known}, [])
         saved = SavedProfiles(directory)
         checks = {f"unit {u}": partial(_check_unit, unit=u, names=names, saved=saved) for u, names in chosen.items()}

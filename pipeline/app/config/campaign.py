@@ -26,7 +26,7 @@ import hashlib
 import math
 import os
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -216,6 +216,12 @@ def find_campaign(name: str) -> Path:
     raise ConfigurationError(
         f"campaign {name!r}: neither data/{name} nor {name} holds a units.csv{nearest(name, shipped)}"
     )
+
+
+def require_unit(unit: str, units: Collection[str], directory: Path) -> None:
+    """Raise ``ConfigurationError`` if a campaign has no such unit."""
+    if unit not in units:
+        raise ConfigurationError(f"no unit {unit!r}{nearest(str(unit), units)}", str(directory / "units.csv"))
 
 
 def run_settings(overrides: Sequence[str]) -> RunSettings:
