@@ -131,36 +131,31 @@ class Recording:
         return float(median(np.diff(self.time_ns))) / SECOND_NS if self.samples > 1 else float("nan")
 
     @cached_property
-    def _quantities(self) -> Quantities:
+    def of_readings(self) -> Quantities:
         """The quantities that are declared ``once``, by function and arguments."""
         return Quantities()
 
     @cached_property
-    def _quantities_of_log(self) -> Quantities:
-        """Those that are declared ``once_of_log``."""
+    def of_log(self) -> Quantities:
+        """Those that are declared ``once_of_log``; those of several recordings are with the log of the first."""
         return Quantities()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what is copied to another process: not the quantities, which contain functions."""
-        return {name: value for name, value in vars(self).items() if not name.startswith("_quantities")}
-
-    @property
-    def results(self) -> Quantities:
-        """What is kept with the log; of several recordings, with that of the first."""
-        return self._quantities_of_log
+        return {name: value for name, value in vars(self).items() if name not in {"of_readings", "of_log"}}
 
     def with_readings(self, **fields: Any) -> Self:  # noqa: ANN401  (of the dataclass)
         """Return the recording with other readings, flags, filter or role, and the same quantities of its log."""
         changed = replace(self, **fields)
-        vars(changed)["_quantities_of_log"] = self._quantities_of_log
+        vars(changed)["of_log"] = self.of_log
         return changed
 
     def with_source(self, source: dict[str, Any], *unread: Callable[..., object]) -> Self:
         """Return the recording with other names of its files; ``unread``: quantities that are no longer kept."""
         changed = object.__new__(type(self))
-        known = (self._quantities, self._quantities_of_log)
-        mine, of_log = (Quantities({k: v for k, v in of.items() if k[0] not in unread}) for of in known)
-        vars(changed).update(vars(self), source=source, _quantities=mine, _quantities_of_log=of_log)
+        known = {"of_readings": self.of_readings, "of_log": self.of_log}
+        kept = {name: Quantities({k: v for k, v in of.items() if k[0] not in unread}) for name, of in known.items()}
+        vars(changed).update(vars(self), source=source, **kept)
         return changed
 
     @property
@@ -213,12 +208,12 @@ def once(compute: OfRecording[Arguments, ReturnedQuantity]) -> OfRecording[Argum
     (``UnitRecordings``), so that each motion of the table, smoothed temperature, list of rests and row of a fit is
     computed once a unit. Callers must not change it.
     """
-    return _kept(compute, lambda recording: recording._quantities)  # noqa: SLF001
+    return _kept(compute, lambda recording: recording.of_readings)
 
 
 def once_of_log(compute: OfRecording[Arguments, ReturnedQuantity]) -> OfRecording[Arguments, ReturnedQuantity]:
     """Declare a quantity as ``once`` that depends on no readings, flags, filter or role (``with_readings``)."""
-    return _kept(compute, lambda recording: recording._quantities_of_log)  # noqa: SLF001
+    return _kept(compute, lambda recording: recording.of_log)
 
 
 def _kept(
