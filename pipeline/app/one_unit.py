@@ -34,6 +34,7 @@ from pipeline.core.errors import (
     PipelineError,
     as_published,
     failure_of,
+    is_of_run,
 )
 from pipeline.core.files import write_atomically
 from pipeline.core.pack import as_bytes
@@ -109,11 +110,9 @@ class ConfiguredUnit:
         """Return the unit after the calibration; an error is that whose code, message and file a run publishes."""
         try:
             return self.run_to("calibration")
-        except PipelineError:
-            raise
         except Exception as error:
-            if isinstance(error, OSError) and error.filename is None:
-                raise  # an error of the machine, not of the unit: a full disk
+            if isinstance(error, PipelineError) or is_of_run(error):
+                raise
             raise as_published(error) from error
 
     @contextmanager
