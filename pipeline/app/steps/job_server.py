@@ -136,9 +136,8 @@ class Request(NamedTuple):
             os.close(stream)
 
 
-NewProcess = tuple[
-    Request, socket.socket | None
-]  # with the channel by which the process gets the next jobs of its batch
+# What a new process runs, with the channel by which it gets the next jobs of its batch.
+NewProcess = tuple[Request, socket.socket | None]
 
 
 class Processes:

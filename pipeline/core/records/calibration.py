@@ -264,9 +264,7 @@ class StageResult:
     name: str
     parameters: Mapping[str, Estimate] = field(default_factory=dict)
     residual_rms: float | None = None  # of the error that the fit minimises, after this stage, unit of the sensor
-    correction: tuple[CorrectionStep, ...] | None = (
-        None  # of readings after this stage, if it is more than matrix and bias
-    )
+    correction: tuple[CorrectionStep, ...] | None = None  # of readings after it, if it is more than matrix and bias
     details: StageDetails = field(default_factory=StageDetails)
 
     def to_json(self) -> dict[str, Any]:
