@@ -276,15 +276,11 @@ def _same_bytes(one: Path, other: Path) -> bool:
 
 
 class ResultsOwner(NamedTuple):
-    """The campaign to which a results folder belongs, in ``.owner.json``.
+    """The campaign to which a results folder belongs, in ``.owner.json``."""
 
-    ``campaign``: its path; ``simulation``: SHA-256 of the description, if the run simulates the recordings; ``units``:
-    unit to the SHA-256 of its recordings.
-    """
-
-    campaign: str
-    simulation: str | None
-    units: dict[str, list[str]]
+    campaign: str  # path
+    simulation: str | None  # SHA-256 of the description, if the run simulates the recordings
+    units: dict[str, list[str]]  # unit to the SHA-256 of its recordings
 
 
 def read_owner(results: Path) -> ResultsOwner | None:

@@ -66,11 +66,11 @@ DOUBTS = {Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUB
 
 
 class Kind(NamedTuple):
-    """A kind of problem: name in lists, meaning, next step where a diagnosis names none, class of style."""
+    """A kind of problem."""
 
-    name: str
+    name: str  # in lists
     meaning: str
-    step: str
+    step: str  # where a diagnosis names none
     css_class: str = "warn"
 
 
@@ -131,12 +131,9 @@ def figure_and_size(words: str) -> tuple[str, str]:
 
 
 class Error(NamedTuple):
-    """The held-out rms error of a sensor before and after calibration, and what noise alone gives, in its unit.
+    """The held-out rms error of a sensor before and after calibration, and what noise alone gives, in its unit."""
 
-    ``kind``: "vector" where the attitude is known in every sample, else "magnitude".
-    """
-
-    kind: str
+    kind: str  # "vector" where the attitude is known in every sample, else "magnitude"
     before: float | None
     after: float | None
     floor: float | None
@@ -148,20 +145,15 @@ class Error(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What keeps units from being ready: a line of a campaign's page and of the terminal.
+    """What keeps units from being ready: a line of a campaign's page and of the terminal."""
 
-    ``kind``: of ``KINDS``; ``what``: sensors, with missing effects; ``units``: the worst first; ``ratios``: smallest
-    and largest error over noise floor; ``step``: what to do next; ``effects``: ``sensor.effect`` that are missing;
-    ``decided``: the figure that decided a verdict, with its range in the units.
-    """
-
-    kind: str
-    what: str
-    units: list[str]
-    ratios: tuple[float, float] | None
-    step: str
-    effects: tuple[str, ...] = ()
-    decided: str = ""
+    kind: str  # of ``KINDS``
+    what: str  # sensors, with missing effects
+    units: list[str]  # the worst first
+    ratios: tuple[float, float] | None  # smallest and largest error over noise floor
+    step: str  # what to do next
+    effects: tuple[str, ...] = ()  # ``sensor.effect`` that are missing
+    decided: str = ""  # the figure that decided a verdict, with its range in the units
 
 
 def error_of(held_out: Mapping[str, Any] | None) -> Error:

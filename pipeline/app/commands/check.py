@@ -84,17 +84,14 @@ class Refused(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The result of one check: the printed text on a log or a unit, its refusals, and its mountings by gravity.
+    """The result of one check, of a log or a unit."""
 
-    ``mounted``: the settings that describe a recording, where gravity shows another mounting than stated. ``saved``:
-    the profile of the campaign that reads what is refused.
-    """
-
-    text: str
+    text: str  # that is printed
     refused: list[Refused]
     unit: str = ""
+    # recording to the settings that describe it, where gravity shows another mounting than stated
     mounted: Mapping[str, Ways] = MappingProxyType({})
-    saved: Path | None = None
+    saved: Path | None = None  # the profile of the campaign that reads what is refused
 
 
 @dataclass

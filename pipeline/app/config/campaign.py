@@ -71,11 +71,7 @@ class UnitRow:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign with all settings resolved.
-
-    ``combine``: ``serial`` estimates units with the same serial jointly; ``lot`` estimates each unit with the prior of
-    its lot.
-    """
+    """A campaign with all settings resolved."""
 
     name: str  # last part of its directory; its results are in ``<results>/<name>``
     directory: Path
@@ -87,7 +83,7 @@ class Campaign:
     simulation: Path | None  # description of the recordings that the run simulates; None for real recordings
     settings: Mapping[str, Any]  # of ``snakemake --config``
     page: str | None  # page in addition to the campaign's page
-    combine: str | None = None
+    combine: str | None = None  # "serial": units of one serial jointly; "lot": each unit with the prior of its lot
     publish_limit: int = 0  # largest number of units whose files are published one by one
     take_over: bool = False  # whether results of another campaign of the same name are moved aside
 

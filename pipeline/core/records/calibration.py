@@ -291,15 +291,11 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class FittedEffect:
-    """A fitted effect.
-
-    ``definition`` is the content of the file of a user's effect, so that the calibration can be applied without that
-    file; None for a built-in effect.
-    """
+    """A fitted effect."""
 
     name: str
     parameters: Mapping[str, Coefficient]
-    definition: dict[str, Any] | None = None
+    definition: dict[str, Any] | None = None  # content of the file of a user's effect, to be applied without the file
 
     @property
     def values(self) -> Values:

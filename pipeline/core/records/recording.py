@@ -79,15 +79,11 @@ class Quantities(dict["tuple[Hashable, ...]", Any]):
 
 @dataclass(frozen=True)
 class Recording:
-    """The samples of one recording.
-
-    ``role``: ``accelerometer`` or ``gyroscope`` (turns for that sensor), ``rests`` (rests and moves without a table),
-    ``validation`` (held out from every fit) or ``static`` (determines the noise model). ``filter``: name and settings
-    of the applied filter; ``delay_s`` of its output (0 if it is zero-phase); ``noise_gain``, its factor on the standard
-    deviation of white noise.
-    """
+    """The samples of one recording."""
 
     name: str  # in the procedure, for example accel_x
+    # ``accelerometer`` or ``gyroscope`` (turns for that sensor), ``rests`` (rests and moves without a table),
+    # ``validation`` (held out from every fit) or ``static`` (determines the noise model)
     role: str
     axis: str | None  # body axis of the table's turns (x, y, z), None without a single axis
     time_ns: Integers  # (n,), ns since power-on
@@ -100,6 +96,7 @@ class Recording:
     flags: NDArray[np.uint16] | None = None  # (n,), bit 0: a gap before this sample, 1: clipped, 2: stuck, 3: repaired
     source: dict[str, Any] = field(default_factory=dict)  # of the input: file, sha256, rows
     notes: tuple[Note, ...] = ()
+    # the applied filter: name, settings, delay of its output (0 if it is zero-phase), factor on white noise
     filter: dict[str, Any] = field(default_factory=lambda: {"name": "none", "delay_s": 0.0, "noise_gain": 1.0})
     clock_shared: bool = True  # whether the time between this recording and the unit's others is known
     setup: str = ""  # table, mounting or session of the recording; empty if the unit has only one
