@@ -243,26 +243,23 @@ class WanderLikelihood:
 class Noise:
     """White noise of a sample (before any filter) and Gauss-Markov bias wander: (3,) standard deviations.
 
-    ``source``, ``wander_source`` and ``time_source`` name the source of the white noise, the wander and its correlation
-    time: ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (scatter of windows of 16 samples in
-    turns about a local polynomial) or ``data_sheet`` (the sensor file). ``length`` is the duration, s, of the static
-    rest, or of all rests by hand that show the wander, else 0; the relative uncertainty of the wander is about
-    ``sqrt(correlation_time / length)``. ``likelihood`` is None without a static recording. ``step``: of the readings of
-    each axis, where it hides the noise (``pipeline.physics.signal.quiet_motion.rounding_of``); else None. ``rounding``:
-    the standard uncertainty of means by these steps.
+    A source is ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (scatter of windows of 16 samples
+    in turns about a local polynomial) or ``data_sheet`` (the sensor file).
     """
 
     white: Values
     wander: Values
-    correlation_time: float
-    source: str
+    correlation_time: float  # s
+    source: str  # of the white noise
     wander_source: str = "data_sheet"
-    time_source: str = "data_sheet"
+    time_source: str = "data_sheet"  # of the correlation time
+    # s, of the static rest, or of all rests by hand that show the wander, else 0; the wander has a relative uncertainty
+    # of about ``sqrt(correlation_time / length)``
     length: float = 0.0
-    likelihood: WanderLikelihood | None = None
+    likelihood: WanderLikelihood | None = None  # None without a static recording
     # each (3,), 0 for an axis whose readings are finer than its noise
-    step: Values | None = None
-    rounding: Values | None = None
+    step: Values | None = None  # of the readings that hide the noise (``pipeline.physics.signal.quiet_motion``)
+    rounding: Values | None = None  # standard uncertainty of means by these steps
 
     def to_json(self) -> dict[str, Any]:
         """Return the noise as JSON values."""
