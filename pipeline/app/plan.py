@@ -9,13 +9,9 @@
 
 Sizes are those that half of the units would show. An effect that needs a size above its limit is not observable.
 
-Propose additional recordings for a procedure, and write the README of a new campaign.
-
-Each proposed change is planned like the procedure itself. Changes with options can be planned and simulated by these
-options. The others are further recordings, to be named in the procedure's configuration.
-
-The README states how to mount and record a unit, the lengths of the recordings, and what they determine: recordings
-and lengths are those of the simulated procedure.
+A change of the procedure is proposed by its own plan. One with options can be planned and simulated by these; the
+others are further recordings, to be named in the procedure's configuration. The README of a new campaign states how to
+mount and record a unit, and the lengths of the recordings and what they determine, as simulated.
 """
 
 from __future__ import annotations
