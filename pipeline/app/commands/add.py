@@ -325,7 +325,6 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
 
 
 def _published(results: Path, unit: str) -> ExportedUnit | None:
-    """Return the published documents of a unit; None where there are none."""
     try:
         documents = [json.loads(read_published(results / d / f"{unit}.json")) for d in ("calibrations", "validations")]
     except FileNotFoundError:
@@ -375,7 +374,6 @@ def _parser(command: str, description: str | None) -> argparse.ArgumentParser:
 
 
 def _effects_of_units(arguments: argparse.Namespace, campaign: str) -> dict[str, list[tuple[str, str]]]:
-    """Return the effects to add or remove, as sensor and name, by unit."""
     missing = getattr(arguments, "missing", None)
     if missing is None:
         if not arguments.unit or not arguments.effects:

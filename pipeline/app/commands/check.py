@@ -155,7 +155,6 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _print_refused(refused: Sequence[Refused]) -> None:
-    """Print a line for each cause of refusals."""
     equal: dict[tuple[str, str], list[str]] = {}
     for refusal in refused:
         equal.setdefault((refusal.code, refusal.message), []).append(refusal.place)
@@ -233,7 +232,6 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Outcome]]]:
 
 
 def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Namespace) -> list[Reading]:
-    """Return the logs, read by a profile and a sensor."""
     profile, sensor = arguments.ingest, arguments.sensor
     config = config_of_log(files[0], profile, sensor, campaign=campaign)
     if arguments.range:

@@ -236,7 +236,6 @@ def _span(recording: Recording, rest: Rest) -> tuple[float, float]:
 
 
 def _next(progress: GuideProgress, goal: float, dwell: float) -> tuple[bool, list[str]]:
-    """Return whether the goal is reached, and the next rest in words."""
     held = sum(progress.held_out)
     count = f"{progress.used} rests of the fit, {held} held out"
     now = (

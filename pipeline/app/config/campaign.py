@@ -187,7 +187,6 @@ def _check_report_numbers(units: Mapping[str, UnitRow], file: str) -> None:
 
 
 def _flag(value: Any, name: str) -> bool:  # noqa: ANN401  (the user's)
-    """Return a setting that is true or false."""
     if str(value).lower() not in ("true", "false"):
         raise ConfigurationError(f"{name}: true or false is expected, got {value!r}")
     return str(value).lower() == "true"

@@ -236,7 +236,6 @@ def _software() -> dict[str, str]:
 
 
 def _missing_s(recording: Recording) -> float:
-    """Return the time in gaps of a recording, s."""
     rows = np.flatnonzero(recording.flags & GAP) if recording.flags is not None else np.zeros(0, int)
     rows = rows[rows > 0]
     return round(float(np.sum(recording.time[rows] - recording.time[rows - 1] - recording.interval)), 6)

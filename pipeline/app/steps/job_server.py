@@ -271,7 +271,6 @@ def _run_job(run_command: Callable[[list[str]], int], request: Request) -> int:
 
 
 def _resident_bytes() -> int:
-    """Return the memory of this process."""
     pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
     return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
