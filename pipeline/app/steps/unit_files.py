@@ -104,9 +104,8 @@ class StoredUnit:
     @property
     def checked(self) -> list[Recording]:
         """Recordings as ingest returned them."""
-        pack = self.job.inputs["ingest"]
-        name = f"{self.unit}.parquet"
-        return self._kept("ingest", "checked", lambda: from_parquet(pack.read(name), str(pack.path)))
+        packs = {"ingest": self.job.inputs["ingest"]}
+        return self._kept("ingest", "checked", lambda: recordings_of(packs, self.unit))
 
     @property
     def recordings(self) -> UnitRecordings:
