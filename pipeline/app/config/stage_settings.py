@@ -155,15 +155,12 @@ def _content(
     if stage in ("ingest", "report"):
         content["campaign"] = campaign.name
     if stage == "ingest":
-        content |= {"directory": str(campaign.recorded), "recordings": _recordings(campaign, rows)}
+        content |= {"directory": str(campaign.recorded), "recordings": None}  # None: the run simulates them
+        if not campaign.simulation:
+            content["recordings"] = {
+                r.name: state_of_recordings(r.config.procedure, r.config.ingest, campaign.folder(r.name)) for r in rows
+            }
     return content
-
-
-def _recordings(campaign: Campaign, rows: Sequence[UnitRow]) -> dict[str, str] | None:
-    """Return the state of the recordings of each unit; None if the run simulates them."""
-    if campaign.simulation:
-        return None
-    return {r.name: state_of_recordings(r.config.procedure, r.config.ingest, campaign.folder(r.name)) for r in rows}
 
 
 def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
