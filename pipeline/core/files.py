@@ -281,25 +281,18 @@ def one_of(*known: str) -> Check:
     return check
 
 
-def mapping(given: object) -> dict[Any, Any]:
-    """Return the value if it is a mapping."""
-    if not isinstance(given, dict):
-        raise expected("a mapping of names", given)
-    return given
+def of_type(kind: type, what: str) -> Check:
+    """Return the check of a value of a type; ``what``: the type in words."""
+
+    def check(given: object) -> object:
+        if not isinstance(given, kind):
+            raise expected(what, given)
+        return given
+
+    return check
 
 
-def text(given: object) -> str:
-    """Return the value if it is a text."""
-    if not isinstance(given, str):
-        raise expected("a text", given)
-    return given
-
-
-def flag(given: object) -> bool:
-    """Return the value if it is true or false."""
-    if not isinstance(given, bool):
-        raise expected("true or false", given)
-    return given
+mapping, text, flag = of_type(dict, "a mapping of names"), of_type(str, "a text"), of_type(bool, "true or false")
 
 
 def number(given: object) -> float:
