@@ -117,10 +117,8 @@ def mapping_of(file: Path) -> dict[Any, Any]:
 @cache
 def default_option(group: str) -> str:
     """Return the default option of a group."""
-    for entry in mapping_of(CONFIGS / "config.yaml")["defaults"]:
-        if not isinstance(entry, str) and group in entry:
-            return str(entry[group])
-    raise KeyError(group)
+    entries = mapping_of(CONFIGS / "config.yaml")["defaults"]
+    return next(str(entry[group]) for entry in entries if isinstance(entry, dict) and group in entry)
 
 
 def check_references(value: Any, where: str | None = None) -> None:  # noqa: ANN401  (any YAML value)
