@@ -62,8 +62,7 @@ class LogChecks:
         self.windows: list[dict[str, Values]] = []
         self.whole: dict[str, bool] = {}
         self.compensated = ""  # evidence that the log is already compensated
-        limits = {key: v if isinstance(v, list) else [-np.inf, v] for key, v in (calibrated_range or {}).items()}
-        self.ranges = {key: (low, high) for key, (low, high) in limits.items()}
+        self.ranges = {key: v if isinstance(v, list) else [-np.inf, v] for key, v in (calibrated_range or {}).items()}
         self.soaked = self.ranges.pop(SOAKED, None)  # the temperatures within which a soak determined the bias
         if self.soaked:
             self.ranges[TEMPERATURE_RANGE] = self.soaked
