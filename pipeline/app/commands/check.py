@@ -120,24 +120,22 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigurationError(f"--save {arguments.save}: the name of a profile's file ends in .yaml")
     tasks = _tasks(arguments)
     countdown, refused = Countdown(len(tasks)), list[Refused]()
-    alike: dict[str, list[str]] = {}
+    alike: dict[str, list[str]] = {}  # the names of logs of one unknown layout, by its message
     mounted, saved = [], dict[Path, list[str]]()
     for number, (what, task) in enumerate(tasks):
         countdown(number, f"checking {what} ({number + 1} of {len(tasks)})")
         outcome = task()
         countdown.end()
-        key = _same_layout(outcome.refused)
-        if key and key in alike:
-            alike[key].append(what)
-        else:
-            alike[key] = [what]
+        names = alike.setdefault(_same_layout(outcome.refused) or str(number), [])
+        if not names:
             print(f"{outcome.text}\n")
+        names.append(what)
         refused += outcome.refused
         mounted.append((outcome.unit, outcome.mounted))
         if outcome.saved:
             saved.setdefault(outcome.saved, []).append(what.removeprefix("unit "))
-    for key, (one, *others) in alike.items():
-        if key and others:
+    for one, *others in alike.values():
+        if others:
             print(_wrapped(f"REFUSED as {one}: {', '.join(others)}") + "\n")
     whole_campaign = not arguments.files and not arguments.unit
     _print_mountings(found_mountings(mounted), len(tasks) if whole_campaign else None)
@@ -363,13 +361,12 @@ def _sheet_proposed(campaign: Campaign, unit: str, saved: SavedProfiles) -> list
     config, folder = campaign.units[unit].config, campaign.folder(unit)
     if not config.procedure.sheet or config.procedure.recordings or not folder.is_dir():
         return []
-    texts, used = [proposed_sheet(folder, config)], ""
-    for file, other in saved.campaigns.items() if not has_rows(texts[0]) else ():
-        texts.append(proposed_sheet(folder, other.units[unit].config))
-        if has_rows(texts[-1]):
+    proposed, used = proposed_sheet(folder, config), ""
+    for file, other in saved.campaigns.items() if not has_rows(proposed) else ():
+        if has_rows(by_saved := proposed_sheet(folder, other.units[unit].config)):
+            proposed = by_saved
             used = f", read with {file}: no setting names it, write ingest={file.stem} into campaign.yaml"
             break
-    proposed = texts[-1] if used else texts[0]
     if not proposed:
         return []
     if not has_rows(proposed):
