@@ -209,13 +209,11 @@ def _describe_rests(recording: Recording, rests: Sequence[tuple[int, int]]) -> s
     if len(rests) == 1:
         return f"1, of {_number(lengths[0], 3)} s" + ": the sensor did not move" * _did_not_move(recording, rests)
     text = f"{len(rests)}, {_number(lengths.min(), 2)} to {_number(lengths.max(), 3)} s long"
-    short = int(np.count_nonzero(lengths < SHORTEST_REST_S))
-    by_hand = recording.role == "rests" and not _turns(recording)
-    return text + (
-        f"; {short} of them are shorter than {SHORTEST_REST_S:g} s, and a run does not use them"
-        * (by_hand and short > 0)
-        + f"; s from the start: {', '.join(shortened(times_of(recording, rests), MOST_RESTS))}" * by_hand
-    )
+    if recording.role != "rests" or _turns(recording):
+        return text
+    if short := int(np.count_nonzero(lengths < SHORTEST_REST_S)):
+        text += f"; {short} of them are shorter than {SHORTEST_REST_S:g} s, and a run does not use them"
+    return f"{text}; s from the start: {', '.join(shortened(times_of(recording, rests), MOST_RESTS))}"
 
 
 def times_of(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[str]:

@@ -235,11 +235,8 @@ def _span(recording: Recording, rest: Rest) -> tuple[float, float]:
 def _next(progress: GuideProgress, goal: float, dwell: float) -> tuple[bool, list[str]]:
     held = sum(progress.held_out)
     count = f"{progress.used} rests of the fit, {held} held out"
-    now = (
-        f"not determined yet: {progress.reason.partition(': ')[0]}"
-        if progress.reason
-        else f"{1e3 * progress.expanded:.3g} mg"
-    )
+    reason = progress.reason.partition(": ")[0]
+    now = f"not determined yet: {reason}" if reason else f"{1e3 * progress.expanded:.3g} mg"
     lines = [f"expanded uncertainty: {now} ({count}; goal {1e3 * goal:.3g} mg)"]
     proposal = propose(progress, goal)
     if not proposal.further:
