@@ -315,12 +315,11 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
     results = Path(arguments.results) / directory.name
     before = {unit: _published(results, unit) for unit in effects_of}
     code = run_snakemake(arguments, arguments.config)
-    own = changes_of(results, list(effects_of)) if code == 0 else []
-    told = shortened(own, NAMED_PER_LINE, "sensors that changed")
-    print("\n".join(told or ["no sensor of these units has another error"] * (code == 0)))
-    after = {unit: _published(results, unit) for unit in effects_of} if code == 0 else {}
-    lines = [line for unit, now in after.items() for line in changed_files(unit, before[unit], now)]
-    print("".join(f"{line}\n" for line in shortened(lines, NAMED_PER_LINE, "changes of files")), end="")
+    if code == 0:
+        told = shortened(changes_of(results, list(effects_of)), NAMED_PER_LINE, "sensors that changed")
+        print("\n".join(told or ["no sensor of these units has another error"]))
+        lines = [line for unit in effects_of for line in changed_files(unit, before[unit], _published(results, unit))]
+        print("".join(f"{line}\n" for line in shortened(lines, NAMED_PER_LINE, "changes of files")), end="")
     return code
 
 
