@@ -299,10 +299,9 @@ def is_owner(results: Path, directory: Path) -> bool:
     Where no owner is recorded, the settings of all runs must name this directory alone.
     """
     owner = read_owner(results)
-    if owner is None and not any(any(results.glob(pattern)) for pattern in OF_A_RUN):
-        return True
     if owner is None:
-        return recorded_directories(results) == {str(directory)}
+        written = any(any(results.glob(pattern)) for pattern in OF_A_RUN)
+        return not written or recorded_directories(results) == {str(directory)}
     with suppress(OSError):
         return os.path.samefile(owner.campaign, directory)  # noqa: PTH121  (texts)
     return owner.campaign == str(directory)
