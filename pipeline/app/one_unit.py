@@ -22,7 +22,7 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from imu_logs import CANONICAL_CSV, load_profile
 from imu_logs.units import CANONICAL, SECOND_NS, SINCE_1970_NS, TRIADS
-from pipeline.app.config.campaign import Campaign, UnitRow, cut_batches
+from pipeline.app.config.campaign import Campaign, UnitRow, cut_batches, require_unit
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import as_list, key_of
 from pipeline.app.config.options import PYTHON, RUN_SETTINGS, nearest, parse
@@ -34,6 +34,7 @@ from pipeline.core.errors import (
     PipelineError,
     as_published,
     failure_of,
+    is_of_run,
 )
 from pipeline.core.files import write_atomically
 from pipeline.core.pack import as_bytes
@@ -109,11 +110,9 @@ class ConfiguredUnit:
         """Return the unit after the calibration; an error is that whose code, message and file a run publishes."""
         try:
             return self.run_to("calibration")
-        except PipelineError:
-            raise
         except Exception as error:
-            if isinstance(error, OSError) and error.filename is None:
-                raise  # an error of the machine, not of the unit: a full disk
+            if isinstance(error, PipelineError) or is_of_run(error):
+                raise
             raise as_published(error) from error
 
     @contextmanager
@@ -139,9 +138,7 @@ def try_unit(unit: ConfiguredUnit, until: str, *, fits: bool = True) -> tuple[Un
 
 def unit_of_campaign(campaign: Campaign, unit: str) -> ConfiguredUnit:
     """Return a unit of a campaign, as a run of the campaign configures it."""
-    if unit not in campaign.units:
-        message = f"no unit {unit!r}{nearest(str(unit), campaign.units)}"
-        raise ConfigurationError(message, str(campaign.directory / "units.csv"))
+    require_unit(unit, campaign.units, campaign.directory)
     batch = next(name for name, units in campaign.batches.items() if unit in units)
     files = UnitFiles(campaign.recorded, campaign.folder(unit))
     return ConfiguredUnit(campaign.units[unit], files, campaign.chains[batch], campaign.run_settings(unit))

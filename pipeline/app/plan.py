@@ -9,13 +9,9 @@
 
 Sizes are those that half of the units would show. An effect that needs a size above its limit is not observable.
 
-Propose additional recordings for a procedure, and write the README of a new campaign.
-
-Each proposed change is planned like the procedure itself. Changes with options can be planned and simulated by these
-options. The others are further recordings, to be named in the procedure's configuration.
-
-The README states how to mount and record a unit, the lengths of the recordings, and what they determine: recordings
-and lengths are those of the simulated procedure.
+A change of the procedure is proposed by its own plan. One with options can be planned and simulated by these; the
+others are further recordings, to be named in the procedure's configuration. The README of a new campaign states how to
+mount and record a unit, and the lengths of the recordings and what they determine, as simulated.
 """
 
 from __future__ import annotations
@@ -29,8 +25,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.app.detection_limits import Detection, DetectionLimits, RestLimits, TurntableLimits
+from pipeline.checks.bench import usual_up
 from pipeline.core.errors import NotObservableError
-from pipeline.core.records import AXES, SENSORS, Fit, Noise, NotCalibrated, Recording, SensorCalibration
+from pipeline.core.files import JSON
+from pipeline.core.records import AXES, SENSORS, Fit, Noise, NotCalibrated, Recording, SensorCalibration, as_json
 from pipeline.core.settings import DataSheet, Settings, assumed_figures
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.observability import at_its_limit, not_observable, not_observable_by_hand
@@ -42,7 +40,6 @@ from pipeline.ingest.recordings_sheet import recordings_of_text
 from pipeline.output.pages.pages import template
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import Owner, unit_of
-from pipeline.physics.kinematics import LEVEL_AT_ZERO
 from pipeline.physics.signal.rests import SETTLING_S
 from pipeline.simulation.campaign import SHEET_FILE, sheet_of, simulate_unit
 from pipeline.simulation.description import (
@@ -66,7 +63,6 @@ ROOM: dict[str, Any] = {
     "periods": np.array([3000.0, 5000.0]), "phases": np.zeros(2),
 }  # fmt: skip
 FAULTLESS: dict[str, Any] = {"angle_accuracy_deg": 0.0, "rate_error": [0.0] * 3, "direction_deg": np.zeros((3, 2))}
-Document = dict[str, Any]
 FASTER_DPS = (100.0, 200.0)  # proposed rates, within a low-cost range of 250 deg/s
 CLEARLY_FASTER = 1.3  # least proposed rate over the procedure's fastest rate
 USABLE_SHARE = 0.9  # of the gyroscope's full scale: its bias needs the remainder
@@ -78,7 +74,7 @@ CLEARLY_SMALLER = 99.5  # per cent
 PRINTED_CHANGES = 3  # changes that are printed
 
 
-def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: bool = False) -> Document:
+def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: bool = False) -> JSON:
     """Return the plan of a unit's procedure with further recordings.
 
     With ``half_only``, ``almost_sure`` and ``named`` are None. Raises ``ConfigurationError`` if a name is unknown or
@@ -89,7 +85,7 @@ def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: 
         "sensor": unit.sensor,
         "table": unit.table,
         "procedure": unit.procedure,
-        "course": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(course_of(unit)).items()},
+        "course": as_json(course_of(unit)),
         "at_a_table": simulated.settings.table.motion != "none",
         "minutes": simulated.minutes,
         "samples": sum(r.samples for r in simulated.recordings),
@@ -123,11 +119,11 @@ def not_shown(unit: UnitDescription, effects: Sequence[str]) -> dict[str, str]:
 
 def of_sensor(
     sensor: str, simulated: SimulatedProcedure, *, half_only: bool = False, only: Collection[str] | None = None
-) -> Document:
+) -> JSON:
     """Return the plan of one sensor; ``only``: of some effects."""
     noise = simulated.noise[sensor]
     noises = {"white": float(noise.white[0]), "wander": float(noise.wander[0])}
-    document: Document = {"unit": unit_of(sensor), "noise": noises, "effects": [], "not_observable": [], "reason": None}
+    document: JSON = {"unit": unit_of(sensor), "noise": noises, "effects": [], "not_observable": [], "reason": None}
     limits: DetectionLimits
     try:
         if is_multi_position(sensor, simulated.recordings):
@@ -166,7 +162,7 @@ def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Select
     return by_hand.SelectionByHand(model, start, [], simulated.noise[sensor], simulated.settings.sensor.of(sensor))
 
 
-def _entry(sensor: str, detection: Detection, *, limited: bool) -> Document:
+def _entry(sensor: str, detection: Detection, *, limited: bool) -> JSON:
     parameters = effect(detection.effect).parameters(sensor)
     first = float(detection.unit_sizes[0])
     almost_sure, named = (s * first if np.isfinite(s * first) else None for s in (detection.sure, detection.named))
@@ -249,7 +245,7 @@ def _warnings(simulated: SimulatedProcedure) -> list[str]:
     return found
 
 
-def plan_text(document: Document, second: Document | None = None) -> list[str]:
+def plan_text(document: JSON, second: JSON | None = None) -> list[str]:
     """Return a plan (``plan_of``) as lines, or two plans side by side."""
     text: str = template("plan.txt").render(
         first=document,
@@ -391,7 +387,7 @@ class PlanGain:
     factor: float  # geometric mean of new over old smallest size, of effects that are observable in both
 
 
-def best_changes(unit: UnitDescription, before: Document) -> list[PlanGain]:
+def best_changes(unit: UnitDescription, before: JSON) -> list[PlanGain]:
     """Return the gain of each change, the most helpful first; ``before`` is the plan of the unit's procedure.
 
     The order is by the number of effects that become observable, in one sensor or both, for each additional minute (at
@@ -408,7 +404,7 @@ def best_changes(unit: UnitDescription, before: Document) -> list[PlanGain]:
     return sorted(gains, key=order)
 
 
-def _gain(change: ProcedureChange, before: Document, after: Document) -> PlanGain:
+def _gain(change: ProcedureChange, before: JSON, after: JSON) -> PlanGain:
     old, new = (  # observable effects by ``sensor.effect``
         {f"{s}.{entry['effect']}": entry for s in SENSORS for entry in document[s]["effects"]}
         for document in (before, after)
@@ -448,7 +444,6 @@ def _listed(keys: Sequence[str]) -> str:
 def readme(unit: UnitDescription, name: str) -> str:
     """Return the README of a campaign with the description of its first unit."""
     settings, course = shipped_settings(procedure=unit.procedure, table=unit.table), course_of(unit)
-    ups = LEVEL_AT_ZERO[:, 2]  # the vertical in the body frame at table angle 0, for turns about each axis
     text: str = template("campaign_readme.md").render(
         name=name,
         unit=unit,
@@ -459,7 +454,7 @@ def readme(unit: UnitDescription, name: str) -> str:
         planned=plan(unit.procedure, course, np.random.default_rng(0)),
         plan=plan_of(unit),
         axes=AXES,
-        up=[f"{'+' if up[i] > 0 else '-'}{AXES[i]}" for up in ups for i in [int(np.argmax(np.abs(up)))]],
+        up=[usual_up(axis) for axis in AXES],
         settling_s=SETTLING_S,
         size_text=size_text,
         share_text=share_text,

@@ -22,7 +22,7 @@ import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from itertools import islice, permutations, product
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ from imu_logs.message_read import LONGEST_ARRAY
 from imu_logs.profile import checks_of, csv_formats
 from imu_logs.units import DEGREES, TRIADS
 from pipeline.app.unit_guesses import FEWEST_RESTS_FOR_A_SPHERE, sphere
-from pipeline.checks.bench import other_axes
+from pipeline.checks.bench import nearest_axis, other_axes, signed_permutations
 from pipeline.core.errors import IngestError, shortened
 from pipeline.core.records import AXES, NOISE_OF_ROWS, SENSOR_UNITS, SENSORS, Note, Recording, median
 from pipeline.core.settings import Ingest, RecordingFile, Sensor, Settings
@@ -209,13 +209,11 @@ def _describe_rests(recording: Recording, rests: Sequence[tuple[int, int]]) -> s
     if len(rests) == 1:
         return f"1, of {_number(lengths[0], 3)} s" + ": the sensor did not move" * _did_not_move(recording, rests)
     text = f"{len(rests)}, {_number(lengths.min(), 2)} to {_number(lengths.max(), 3)} s long"
-    short = int(np.count_nonzero(lengths < SHORTEST_REST_S))
-    by_hand = recording.role == "rests" and not _turns(recording)
-    return text + (
-        f"; {short} of them are shorter than {SHORTEST_REST_S:g} s, and a run does not use them"
-        * (by_hand and short > 0)
-        + f"; s from the start: {', '.join(shortened(times_of(recording, rests), MOST_RESTS))}" * by_hand
-    )
+    if recording.role != "rests" or _turns(recording):
+        return text
+    if short := int(np.count_nonzero(lengths < SHORTEST_REST_S)):
+        text += f"; {short} of them are shorter than {SHORTEST_REST_S:g} s, and a run does not use them"
+    return f"{text}; s from the start: {', '.join(shortened(times_of(recording, rests), MOST_RESTS))}"
 
 
 def times_of(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[str]:
@@ -226,13 +224,10 @@ def times_of(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[str
 
 def rests_in_short(recording: Recording) -> str:
     """Return the number of a recording's rests, and the times of the first and the last; empty for fewer than two."""
-    rests = [(r.start, r.stop) for r in _accepted(recording)]
-    first, *_, last = times_of(recording, rests) if len(rests) > 1 else ["", ""]
-    return (
-        f"{recording.name}: {len(rests)}, the first at {first} s, the last at {last} s; check FILE lists all"
-        if first
-        else ""
-    )
+    times = times_of(recording, [(r.start, r.stop) for r in _accepted(recording)])
+    if len(times) < 2:
+        return ""
+    return f"{recording.name}: {len(times)}, the first at {times[0]} s, the last at {times[-1]} s; check FILE lists all"
 
 
 def _did_not_move(recording: Recording, rests: Sequence[tuple[int, int]]) -> bool:
@@ -540,12 +535,10 @@ def _other_axes(recordings: Sequence[Recording], bias: Values) -> list[str]:
     if not pairs:
         return []
     change, omega, u = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-    costs = {}
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        rate = omega[:, order] * signs
-        costs[order, signs] = float(np.sum((change + np.cross(rate, u)) ** 2))
-    (order, signs), least = min(costs.items(), key=lambda item: item[1])
-    if least > CLEARER * costs[(0, 1, 2), (1.0, 1.0, 1.0)]:
-        return []
-    body = sorted(zip(order, signs, AXES, strict=True))
-    return [f"{'+' if sign > 0.0 else '-'}{name}" for _, sign, name in body]
+
+    def misfit(P: Values) -> float:
+        return float(np.sum((change + np.cross(omega @ P.T, u)) ** 2))
+
+    nearest = min(signed_permutations(), key=misfit)
+    clearer = misfit(nearest) <= CLEARER * misfit(np.eye(3))
+    return [nearest_axis(column) for column in nearest.T] if clearer else []

@@ -276,15 +276,11 @@ def _same_bytes(one: Path, other: Path) -> bool:
 
 
 class ResultsOwner(NamedTuple):
-    """The campaign to which a results folder belongs, in ``.owner.json``.
+    """The campaign to which a results folder belongs, in ``.owner.json``."""
 
-    ``campaign``: its path; ``simulation``: SHA-256 of the description, if the run simulates the recordings; ``units``:
-    unit to the SHA-256 of its recordings.
-    """
-
-    campaign: str
-    simulation: str | None
-    units: dict[str, list[str]]
+    campaign: str  # path
+    simulation: str | None  # SHA-256 of the description, if the run simulates the recordings
+    units: dict[str, list[str]]  # unit to the SHA-256 of its recordings
 
 
 def read_owner(results: Path) -> ResultsOwner | None:
@@ -303,10 +299,9 @@ def is_owner(results: Path, directory: Path) -> bool:
     Where no owner is recorded, the settings of all runs must name this directory alone.
     """
     owner = read_owner(results)
-    if owner is None and not any(any(results.glob(pattern)) for pattern in OF_A_RUN):
-        return True
     if owner is None:
-        return recorded_directories(results) == {str(directory)}
+        written = any(any(results.glob(pattern)) for pattern in OF_A_RUN)
+        return not written or recorded_directories(results) == {str(directory)}
     with suppress(OSError):
         return os.path.samefile(owner.campaign, directory)  # noqa: PTH121  (texts)
     return owner.campaign == str(directory)

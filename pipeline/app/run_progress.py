@@ -42,10 +42,7 @@ COST = {
     "calibration": 0.85, "export": 0.2, "report": 0.85, "summary": 0.5, "gather": 4.0, "verdict": 0.0, "all": 0.0,
 }  # fmt: skip
 PRIOR = 40.0  # weight of ``COST``, in units
-PER_BATCH = (
-    "collect", "ingest", "filter", "fit", "fit effects", "validate", "diagnose", "calibration", "export", "report",
-    "summary", "prior",
-)  # fmt: skip
+PER_RUN = ("simulate", "lots", "gather", "thesis", "verdict", "all")  # jobs of every other kind are of a batch
 AT_UNIT = re.compile(r"^[\w-]+: (\S+) \((\d+) of (\d+)\)$", re.MULTILINE)
 EFFECTS_STAGE_TITLE = "fit effects"
 MIN_REMAINING_SHARE = 0.1  # least remaining time of a current unit, as a share of its usual or its elapsed time
@@ -164,7 +161,7 @@ class Progress:
         ]
         waiting = self.wanted - Counter(job.kind for job in (*self.done, *self.running.values()))
         mean_batch = sum(self.batches.values()) / max(len(self.batches), 1)
-        per_job = {kind: usual[kind] * (mean_batch if kind in PER_BATCH else 1.0) for kind in waiting}
+        per_job = {kind: usual[kind] * (1.0 if kind in PER_RUN else mean_batch) for kind in waiting}
         total = sum(running) + sum(per_job[kind] * count for kind, count in waiting.items())
         parallel_jobs = max(worked / max(time.monotonic() - self.started, 1e-3), 1.0)
         serial = 0.0  # of the jobs that follow each other in one batch

@@ -14,38 +14,27 @@ from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, spec_from_file_location
 from types import CodeType, ModuleType
 
-FORMER = {  # name of version 0.1: name now; of a package, with its modules
-    "pipeline.commands": "pipeline.app.commands",
-    "pipeline.config": "pipeline.app.config",
-    "pipeline.stages": "pipeline.app.steps",
-    "pipeline.planning": "pipeline.app",
-    "pipeline.profile_detection": "pipeline.app",
-    "pipeline.field_logs": "pipeline.app.field_logs",
-    "pipeline.io": "pipeline.ingest",
-    "pipeline.results_folder": "pipeline.app.results_folder",
-    "pipeline.run_progress": "pipeline.app.run_progress",
-    "pipeline.one_unit": "pipeline.app.one_unit",
-    "pipeline.result": "pipeline.app.one_unit",
-    "pipeline.campaign_results": "pipeline.output.campaign_results",
-    "pipeline.history": "pipeline.output.history",
-    "pipeline.outcome": "pipeline.output.outcome",
-    "pipeline.report": "pipeline.output.pages",
-    "pipeline.exports": "pipeline.output.exports",
-    "pipeline.validation": "pipeline.evaluation.held_out",
-    "pipeline.diagnosis": "pipeline.evaluation.diagnosis",
-    "pipeline.preprocessing": "pipeline.checks",
-    "pipeline.model": "pipeline.physics",
-    "pipeline.signal": "pipeline.physics.signal",
-    "pipeline.records": "pipeline.core.records",
-    "pipeline.errors": "pipeline.core.errors",
-    "pipeline.files": "pipeline.core.files",
-    "pipeline.pack": "pipeline.core.pack",
-    "pipeline.settings": "pipeline.core.settings",
-    "pipeline.verdicts": "pipeline.core.verdicts",
-    "pipeline.version": "pipeline.core",
-    "pipeline.study": "imu_research.study",
-    "pipeline.thesis": "imu_research.thesis",
+MOVED = {  # where modules and packages are that stood in ``pipeline`` in version 0.1, and have the same name
+    "pipeline.app": ("commands", "config", "field_logs", "one_unit", "results_folder", "run_progress"),
+    "pipeline.core": ("errors", "files", "pack", "records", "settings", "verdicts"),
+    "pipeline.evaluation": ("diagnosis",),
+    "pipeline.output": ("campaign_results", "exports", "history", "outcome"),
+    "pipeline.physics": ("signal",),
+    "imu_research": ("study", "thesis"),
 }
+RENAMED = {
+    "pipeline.io": "pipeline.ingest",
+    "pipeline.model": "pipeline.physics",
+    "pipeline.planning": "pipeline.app",
+    "pipeline.preprocessing": "pipeline.checks",
+    "pipeline.profile_detection": "pipeline.app",
+    "pipeline.report": "pipeline.output.pages",
+    "pipeline.result": "pipeline.app.one_unit",
+    "pipeline.stages": "pipeline.app.steps",
+    "pipeline.validation": "pipeline.evaluation.held_out",
+    "pipeline.version": "pipeline.core",
+}
+FORMER = {f"pipeline.{name}": f"{place}.{name}" for place, names in MOVED.items() for name in names} | RENAMED
 
 
 class SameModule(MetaPathFinder, Loader):

@@ -77,16 +77,7 @@ class Pack:
     def _checked(self, read: Callable[[], Any], name: str = "") -> Any:  # noqa: ANN401
         try:
             return read()
-        except (
-            OSError,
-            KeyError,
-            ValueError,
-            EOFError,
-            NotImplementedError,
-            RuntimeError,
-            zipfile.BadZipFile,
-            zlib.error,
-        ) as error:
+        except (OSError, KeyError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
             what = f"{name or 'it'} cannot be read, it is missing or damaged ({error})"
             raise DamagedFileError(f"{what}; {WRITE_AGAIN}", str(self.path)) from None
 

@@ -4,12 +4,9 @@ Comments in ``configs/`` explain each key. Unknown keys are refused, except in c
 of effects, whose keys are names of channels and effects. A step of the chain has the sections that ``STEPS`` in
 ``pipeline.unit`` names; an access to another section raises ``AttributeError``.
 
-Complete a sensor's file (``configs/sensor``): figures of a chosen range, and figures that its data sheet omits.
-
-``ranges`` maps a full scale to counts per unit; the override ``sensor.accelerometer.range=6`` sets ``full_scale`` and
-``counts_per_unit`` of that range. A figure that is null or absent is taken from ``generic``, and its name is listed in
-``assumed``. The same applies to all figures of a sensor that the chip does not have. Full scale and counts are never
-taken from ``generic`` for a sensor that the chip has.
+In a sensor's file, ``ranges`` maps a full scale to counts per unit; the override ``sensor.accelerometer.range=6`` sets
+``full_scale`` and ``counts_per_unit`` of that range. ``completed`` takes figures that are null or absent from
+``generic``, and lists their names in ``assumed``; full scale and counts only for a sensor that the chip does not have.
 """
 
 from __future__ import annotations

@@ -66,11 +66,11 @@ DOUBTS = {Verdict.REFERENCE_IN_DOUBT, Verdict.UNEXPLAINED, Verdict.FLOOR_IN_DOUB
 
 
 class Kind(NamedTuple):
-    """A kind of problem: name in lists, meaning, next step where a diagnosis names none, class of style."""
+    """A kind of problem."""
 
-    name: str
+    name: str  # in lists
     meaning: str
-    step: str
+    step: str  # where a diagnosis names none
     css_class: str = "warn"
 
 
@@ -131,12 +131,9 @@ def figure_and_size(words: str) -> tuple[str, str]:
 
 
 class Error(NamedTuple):
-    """The held-out rms error of a sensor before and after calibration, and what noise alone gives, in its unit.
+    """The held-out rms error of a sensor before and after calibration, and what noise alone gives, in its unit."""
 
-    ``kind``: "vector" where the attitude is known in every sample, else "magnitude".
-    """
-
-    kind: str
+    kind: str  # "vector" where the attitude is known in every sample, else "magnitude"
     before: float | None
     after: float | None
     floor: float | None
@@ -148,20 +145,15 @@ class Error(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What keeps units from being ready: a line of a campaign's page and of the terminal.
+    """What keeps units from being ready: a line of a campaign's page and of the terminal."""
 
-    ``kind``: of ``KINDS``; ``what``: sensors, with missing effects; ``units``: the worst first; ``ratios``: smallest
-    and largest error over noise floor; ``step``: what to do next; ``effects``: ``sensor.effect`` that are missing;
-    ``decided``: the figure that decided a verdict, with its range in the units.
-    """
-
-    kind: str
-    what: str
-    units: list[str]
-    ratios: tuple[float, float] | None
-    step: str
-    effects: tuple[str, ...] = ()
-    decided: str = ""
+    kind: str  # of ``KINDS``
+    what: str  # sensors, with missing effects
+    units: list[str]  # the worst first
+    ratios: tuple[float, float] | None  # smallest and largest error over noise floor
+    step: str  # what to do next
+    effects: tuple[str, ...] = ()  # ``sensor.effect`` that are missing
+    decided: str = ""  # the figure that decided a verdict, with its range in the units
 
 
 def error_of(held_out: Mapping[str, Any] | None) -> Error:
@@ -176,20 +168,17 @@ def error_of(held_out: Mapping[str, Any] | None) -> Error:
 
 def error_in_row(row: Mapping[str, Any], sensor: str) -> Error:
     """Return the same from a row of ``summary.csv``."""
-    for kind, prefix in (("vector", f"{sensor}_vector"), ("magnitude", sensor)):
-        floor = _number(row.get(f"{prefix}_noise_floor"))
-        if floor or kind == "magnitude":
-            before, after = _number(row.get(f"{prefix}_error_before")), _number(row.get(f"{prefix}_error_after"))
-            break
-    return Error(kind, before, after, floor)
+    by_vector = _number(row.get(f"{sensor}_vector_noise_floor"))
+    kind, prefix = ("vector", f"{sensor}_vector") if by_vector else ("magnitude", sensor)
+    return Error(kind, *(_number(row.get(f"{prefix}_{n}")) for n in ("error_before", "error_after", "noise_floor")))
 
 
 class RowState(NamedTuple):
-    """A row of ``summary.csv`` with its errors by sensor, and what keeps the unit from being ready (``kinds_of``)."""
+    """A row of ``summary.csv`` with its errors by sensor, and what keeps the unit from being ready."""
 
     row: Mapping[str, Any]
     errors: dict[str, Error]
-    kinds: dict[str, list[str]]
+    kinds: dict[str, list[str]]  # the most urgent kind first, each with the sensors concerned
 
 
 def state_of(row: Mapping[str, Any] | RowState) -> RowState:
@@ -204,11 +193,6 @@ def _number(value: Any) -> float | None:  # noqa: ANN401  (a cell: a number, a t
     if isinstance(value, str):
         value = float(value or "nan")
     return float(value) if value is not None and -math.inf < value < math.inf else None
-
-
-def kinds_of(row: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return what keeps a unit from being ready, the most urgent kind first, with the sensors concerned."""
-    return state_of(row).kinds
 
 
 def _kinds(row: Mapping[str, Any], errors: Mapping[str, Error]) -> dict[str, list[str]]:

@@ -249,9 +249,9 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Table) -> Obser
         mounting_in_doubt=doubt,
         angle_deg=table.angle_accuracy_deg if table.motion == "logged" else 0.0,
         levelling_deg=table.levelling_deg or 0.0,
-        kept=ref(recordings[0].results) if recordings else None,
+        kept=ref(recordings[0].of_log) if recordings else None,
     )
-    return recordings[0].results.once((found.parts, table, doubt), lambda: found) if parts else found
+    return recordings[0].of_log.once((found.parts, table, doubt), lambda: found) if parts else found
 
 
 def _rows(recording: Recording, sensor: str, motion: Motion) -> RecordingRows | None:

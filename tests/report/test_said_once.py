@@ -11,7 +11,7 @@ from unit_settings import settings_of
 from pipeline.app.commands.explain import explain
 from pipeline.core.files import write_json
 from pipeline.core.records import SENSORS
-from pipeline.core.verdicts import decided_words, error_in_row, error_of, kinds_of, problems
+from pipeline.core.verdicts import decided_words, error_in_row, error_of, problems, state_of
 from pipeline.evaluation import diagnosis as diagnosis_package
 from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.output import pages as report_package
@@ -180,7 +180,7 @@ def test_units_are_counted_once_by_their_most_urgent_problem() -> None:
         of_unit | {"unit": "e", "incomplete": "diagnose/gyroscope: x", "gyroscope_verdict": "not_enough_data"},
         {"unit": "f", "serial": "S", "status": "failed"},
     ]
-    kinds = [next(iter(kinds_of(row)), "ready") for row in rows]
+    kinds = [next(iter(state_of(row).kinds), "ready") for row in rows]
     assert kinds == ["ready", "missing_effect", "far_above_noise", "beyond_acceptance", "incomplete", "failed"]
     found = {p.kind: (p.what, p.units) for p in problems(rows)}
     assert found["missing_effect"] == ("gyroscope: g sensitivity", ["b"])

@@ -20,7 +20,7 @@ import yaml
 
 from pipeline.app.commands import add_run_options, parser_of
 from pipeline.app.commands.run import run_snakemake
-from pipeline.app.config.campaign import TAKE_OVER, find_campaign, read_layers
+from pipeline.app.config.campaign import TAKE_OVER, find_campaign, read_layers, require_unit
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import DEVICES_FOLDER, Layer, Layers, key_of
 from pipeline.app.config.options import nearest, parse
@@ -113,13 +113,12 @@ def edit_effects(
 
 def _file(unit: str, layers: Layers, directory: Path) -> Path:
     """Return the device file of a unit; the unit must exist, and its name must not be the serial of another unit."""
-    rows, units_table = layers.units_table.rows, str(directory / "units.csv")
-    if unit not in rows:
-        raise ConfigurationError(f"no unit {unit!r}{nearest(unit, rows)}", units_table)
+    rows = layers.units_table.rows
+    require_unit(unit, rows, directory)
     others = [u for u, row in rows.items() if row.get("serial") == unit and u != unit]
     if others:
         both = f"{DEVICES_FOLDER}/{unit}.yaml would concern {', '.join(others)} too, whose serial is {unit}"
-        raise ConfigurationError(f"{both}: give the unit or the serial another name", units_table)
+        raise ConfigurationError(f"{both}: give the unit or the serial another name", str(directory / "units.csv"))
     return directory / DEVICES_FOLDER / f"{unit}.yaml"
 
 
@@ -316,17 +315,15 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
     results = Path(arguments.results) / directory.name
     before = {unit: _published(results, unit) for unit in effects_of}
     code = run_snakemake(arguments, arguments.config)
-    own = changes_of(results, list(effects_of)) if code == 0 else []
-    told = shortened(own, NAMED_PER_LINE, "sensors that changed")
-    print("\n".join(told or ["no sensor of these units has another error"] * (code == 0)))
-    after = {unit: _published(results, unit) for unit in effects_of} if code == 0 else {}
-    lines = [line for unit, now in after.items() for line in changed_files(unit, before[unit], now)]
-    print("".join(f"{line}\n" for line in shortened(lines, NAMED_PER_LINE, "changes of files")), end="")
+    if code == 0:
+        told = shortened(changes_of(results, list(effects_of)), NAMED_PER_LINE, "sensors that changed")
+        print("\n".join(told or ["no sensor of these units has another error"]))
+        lines = [line for unit in effects_of for line in changed_files(unit, before[unit], _published(results, unit))]
+        print("".join(f"{line}\n" for line in shortened(lines, NAMED_PER_LINE, "changes of files")), end="")
     return code
 
 
 def _published(results: Path, unit: str) -> ExportedUnit | None:
-    """Return the published documents of a unit; None where there are none."""
     try:
         documents = [json.loads(read_published(results / d / f"{unit}.json")) for d in ("calibrations", "validations")]
     except FileNotFoundError:
@@ -376,7 +373,6 @@ def _parser(command: str, description: str | None) -> argparse.ArgumentParser:
 
 
 def _effects_of_units(arguments: argparse.Namespace, campaign: str) -> dict[str, list[tuple[str, str]]]:
-    """Return the effects to add or remove, as sensor and name, by unit."""
     missing = getattr(arguments, "missing", None)
     if missing is None:
         if not arguments.unit or not arguments.effects:

@@ -20,8 +20,7 @@ from imu_logs.guesses import TO_DECIDE
 from imu_logs.proposal import Proposal, layouts_of, not_found
 from pipeline.app.commands import parser_of
 from pipeline.app.commands.readings import Reading, campaign_of, config_of_log, recordings_of_files
-from pipeline.app.config.campaign import Campaign, find_campaign, load_campaign
-from pipeline.app.config.options import nearest
+from pipeline.app.config.campaign import Campaign, find_campaign, load_campaign, require_unit
 from pipeline.app.one_unit import try_unit, unit_of_campaign
 from pipeline.app.recording_facts import (
     SUITS_FERRARIS,
@@ -85,17 +84,14 @@ class Refused(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The result of one check: the printed text on a log or a unit, its refusals, and its mountings by gravity.
+    """The result of one check, of a log or a unit."""
 
-    ``mounted``: the settings that describe a recording, where gravity shows another mounting than stated. ``saved``:
-    the profile of the campaign that reads what is refused.
-    """
-
-    text: str
+    text: str  # that is printed
     refused: list[Refused]
     unit: str = ""
+    # recording to the settings that describe it, where gravity shows another mounting than stated
     mounted: Mapping[str, Ways] = MappingProxyType({})
-    saved: Path | None = None
+    saved: Path | None = None  # the profile of the campaign that reads what is refused
 
 
 @dataclass
@@ -124,24 +120,22 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigurationError(f"--save {arguments.save}: the name of a profile's file ends in .yaml")
     tasks = _tasks(arguments)
     countdown, refused = Countdown(len(tasks)), list[Refused]()
-    alike: dict[str, list[str]] = {}
+    alike: dict[str, list[str]] = {}  # the names of logs of one unknown layout, by its message
     mounted, saved = [], dict[Path, list[str]]()
     for number, (what, task) in enumerate(tasks):
         countdown(number, f"checking {what} ({number + 1} of {len(tasks)})")
         outcome = task()
         countdown.end()
-        key = _same_layout(outcome.refused)
-        if key and key in alike:
-            alike[key].append(what)
-        else:
-            alike[key] = [what]
+        names = alike.setdefault(_same_layout(outcome.refused) or str(number), [])
+        if not names:
             print(f"{outcome.text}\n")
+        names.append(what)
         refused += outcome.refused
         mounted.append((outcome.unit, outcome.mounted))
         if outcome.saved:
             saved.setdefault(outcome.saved, []).append(what.removeprefix("unit "))
-    for key, (one, *others) in alike.items():
-        if key and others:
+    for one, *others in alike.values():
+        if others:
             print(_wrapped(f"REFUSED as {one}: {', '.join(others)}") + "\n")
     whole_campaign = not arguments.files and not arguments.unit
     _print_mountings(found_mountings(mounted), len(tasks) if whole_campaign else None)
@@ -159,7 +153,6 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _print_refused(refused: Sequence[Refused]) -> None:
-    """Print a line for each cause of refusals."""
     equal: dict[tuple[str, str], list[str]] = {}
     for refusal in refused:
         equal.setdefault((refusal.code, refusal.message), []).append(refusal.place)
@@ -226,10 +219,7 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Outcome]]]:
             continue
         campaign = load_campaign({"campaign": str(directory)})
         known = [arguments.unit] if arguments.unit else list(campaign.units)
-        if known[0] not in campaign.units:
-            raise ConfigurationError(
-                f"no unit {known[0]!r}{nearest(known[0], campaign.units)}", str(directory / "units.csv")
-            )
+        require_unit(known[0], campaign.units, directory)
         chosen, others = recordings_of_files(files, campaign, known) if files else ({unit: [] for unit in known}, [])
         saved = SavedProfiles(directory)
         checks = {f"unit {u}": partial(_check_unit, unit=u, names=names, saved=saved) for u, names in chosen.items()}
@@ -240,7 +230,6 @@ def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Outcome]]]:
 
 
 def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Namespace) -> list[Reading]:
-    """Return the logs, read by a profile and a sensor."""
     profile, sensor = arguments.ingest, arguments.sensor
     config = config_of_log(files[0], profile, sensor, campaign=campaign)
     if arguments.range:
@@ -372,13 +361,12 @@ def _sheet_proposed(campaign: Campaign, unit: str, saved: SavedProfiles) -> list
     config, folder = campaign.units[unit].config, campaign.folder(unit)
     if not config.procedure.sheet or config.procedure.recordings or not folder.is_dir():
         return []
-    texts, used = [proposed_sheet(folder, config)], ""
-    for file, other in saved.campaigns.items() if not has_rows(texts[0]) else ():
-        texts.append(proposed_sheet(folder, other.units[unit].config))
-        if has_rows(texts[-1]):
+    proposed, used = proposed_sheet(folder, config), ""
+    for file, other in saved.campaigns.items() if not has_rows(proposed) else ():
+        if has_rows(by_saved := proposed_sheet(folder, other.units[unit].config)):
+            proposed = by_saved
             used = f", read with {file}: no setting names it, write ingest={file.stem} into campaign.yaml"
             break
-    proposed = texts[-1] if used else texts[0]
     if not proposed:
         return []
     if not has_rows(proposed):

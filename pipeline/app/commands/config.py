@@ -13,10 +13,10 @@ from typing import Any
 import yaml
 
 from pipeline.app.commands import parser_of
-from pipeline.app.config.campaign import find_campaign, read_layers
+from pipeline.app.config.campaign import find_campaign, read_layers, require_unit
 from pipeline.app.config.compose import Composer
 from pipeline.app.config.layers import Layer
-from pipeline.app.config.options import GROUPS, PYTHON, default_option, nearest, parse, read_option
+from pipeline.app.config.options import GROUPS, PYTHON, default_option, parse, read_option
 from pipeline.core.errors import ConfigurationError
 from pipeline.core.files import CONFIGS
 from pipeline.core.settings import REQUIRED_FIGURES, range_settings
@@ -37,10 +37,7 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_intermixed_args(argv)
     directory, unit = find_campaign(arguments.campaign), arguments.unit
     composer, all_layers = read_layers(directory, {"overrides": arguments.overrides, PYTHON: arguments.python_effect})
-    if unit not in all_layers.units_table.rows:
-        raise ConfigurationError(
-            f"no unit {unit!r}{nearest(unit, all_layers.units_table.rows)}", str(directory / "units.csv")
-        )
+    require_unit(unit, all_layers.units_table.rows, directory)
     layers = all_layers.of(unit)
     try:
         config = composer.unit(unit, [text for _, text in layers])

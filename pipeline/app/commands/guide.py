@@ -43,12 +43,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--goal", type=float, metavar="MG", help=wanted)
     wanted = "wanted expanded uncertainty of the gyroscope's matrix (default: only the accelerometer is guided)"
     add("--gyroscope-goal", type=float, metavar="PERCENT", help=wanted)
-    add(
-        "--dwell",
-        type=float,
-        metavar="S",
-        default=REST_BY_HAND_S,
-        help="planned length of a rest (default: %(default)g)",
-    )
+    words = "planned length of a rest (default: %(default)g)"
+    add("--dwell", type=float, metavar="S", default=REST_BY_HAND_S, help=words)
     add("--procedure", metavar="NAME", help="multi_position (default), orientations_24, six_positions or ferraris")
     return parser

@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imu_logs.profile import checks_of
-from pipeline.app.commands.readings import campaign_of, complete_rows, config_of_log, recordings_of_files
+from pipeline.app.commands.readings import Reading, campaign_of, complete_rows, config_of_log, recordings_of_files
 from pipeline.app.config.campaign import load_campaign
 from pipeline.app.guide import (
     MAX_PLANNED_RESTS,
@@ -33,7 +32,6 @@ from pipeline.core.records import NotCalibrated, Recording, Values
 from pipeline.core.settings import RecordingFile, Settings
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.ingest.files import grouped, recording_files
-from pipeline.ingest.read import read_table, to_recording
 from pipeline.physics.signal.rests import WINDOW_S, Rest, find_rests
 from pipeline.unit import Task, UnitFiles, UnitState, run_steps
 
@@ -70,10 +68,9 @@ class Source:
         whole = []
         with tempfile.TemporaryDirectory() as folder:
             for name, (entry, files) in entries.items():
-                table = read_table([complete_rows(f, Path(folder)) for f in files] if growing else files, ingest)
+                rows = [complete_rows(f, Path(folder)) for f in files] if growing else files
                 role = "rests" if entry.role == "session" and not entry.windows else entry.role
-                read = to_recording(name, entry.replaced(role=role), table, self.config.sensor, checks_of(ingest))
-                whole.append(read)
+                whole.append(Reading(rows, name, entry.replaced(role=role), settings).recording())
         unit = UnitState("unit", UnitFiles(Path(), Path(), recordings=whole))
         return run_steps(unit, iter([Task("ingest")]), lambda _: settings).checked or [] if whole else []
 
@@ -236,14 +233,10 @@ def _span(recording: Recording, rest: Rest) -> tuple[float, float]:
 
 
 def _next(progress: GuideProgress, goal: float, dwell: float) -> tuple[bool, list[str]]:
-    """Return whether the goal is reached, and the next rest in words."""
     held = sum(progress.held_out)
     count = f"{progress.used} rests of the fit, {held} held out"
-    now = (
-        f"not determined yet: {progress.reason.partition(': ')[0]}"
-        if progress.reason
-        else f"{1e3 * progress.expanded:.3g} mg"
-    )
+    reason = progress.reason.partition(": ")[0]
+    now = f"not determined yet: {reason}" if reason else f"{1e3 * progress.expanded:.3g} mg"
     lines = [f"expanded uncertainty: {now} ({count}; goal {1e3 * goal:.3g} mg)"]
     proposal = propose(progress, goal)
     if not proposal.further:

@@ -26,7 +26,7 @@ import hashlib
 import math
 import os
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -71,11 +71,7 @@ class UnitRow:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign with all settings resolved.
-
-    ``combine``: ``serial`` estimates units with the same serial jointly; ``lot`` estimates each unit with the prior of
-    its lot.
-    """
+    """A campaign with all settings resolved."""
 
     name: str  # last part of its directory; its results are in ``<results>/<name>``
     directory: Path
@@ -87,7 +83,7 @@ class Campaign:
     simulation: Path | None  # description of the recordings that the run simulates; None for real recordings
     settings: Mapping[str, Any]  # of ``snakemake --config``
     page: str | None  # page in addition to the campaign's page
-    combine: str | None = None
+    combine: str | None = None  # "serial": units of one serial jointly; "lot": each unit with the prior of its lot
     publish_limit: int = 0  # largest number of units whose files are published one by one
     take_over: bool = False  # whether results of another campaign of the same name are moved aside
 
@@ -191,7 +187,6 @@ def _check_report_numbers(units: Mapping[str, UnitRow], file: str) -> None:
 
 
 def _flag(value: Any, name: str) -> bool:  # noqa: ANN401  (the user's)
-    """Return a setting that is true or false."""
     if str(value).lower() not in ("true", "false"):
         raise ConfigurationError(f"{name}: true or false is expected, got {value!r}")
     return str(value).lower() == "true"
@@ -216,6 +211,12 @@ def find_campaign(name: str) -> Path:
     raise ConfigurationError(
         f"campaign {name!r}: neither data/{name} nor {name} holds a units.csv{nearest(name, shipped)}"
     )
+
+
+def require_unit(unit: str, units: Collection[str], directory: Path) -> None:
+    """Raise ``ConfigurationError`` if a campaign has no such unit."""
+    if unit not in units:
+        raise ConfigurationError(f"no unit {unit!r}{nearest(str(unit), units)}", str(directory / "units.csv"))
 
 
 def run_settings(overrides: Sequence[str]) -> RunSettings:

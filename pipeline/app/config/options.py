@@ -117,10 +117,8 @@ def mapping_of(file: Path) -> dict[Any, Any]:
 @cache
 def default_option(group: str) -> str:
     """Return the default option of a group."""
-    for entry in mapping_of(CONFIGS / "config.yaml")["defaults"]:
-        if not isinstance(entry, str) and group in entry:
-            return str(entry[group])
-    raise KeyError(group)
+    entries = mapping_of(CONFIGS / "config.yaml")["defaults"]
+    return next(str(entry[group]) for entry in entries if isinstance(entry, dict) and group in entry)
 
 
 def check_references(value: Any, where: str | None = None) -> None:  # noqa: ANN401  (any YAML value)
@@ -261,16 +259,12 @@ def effects_for(stage: str, sensor: str, units: Sequence[Settings]) -> dict[str,
         return {}
     formulas, python = section.formulas, section.python
     if stage not in ("diagnose", "report"):
-        wanted: set[str] = set()
-        for unit in units:
-            for of_sensor in SENSORS:
-                names = unit.effects.of(of_sensor)
-                if sensor in ("", of_sensor):
-                    wanted |= {"auto"} if names == "auto" else set(names)
-        everything = "auto" in wanted
+        configured = [unit.effects.of(s) for unit in units for s in SENSORS if sensor in ("", s)]
+        if "auto" not in configured:
+            wanted = {name for names in configured for name in names}
+            formulas = [d for d in formulas if d["name"] in wanted]
+            python = [e for e in python if Path(e["path"]).stem in wanted]
         formulas = formulas if stage == "effects" else []
-        formulas = [d for d in formulas if everything or d["name"] in wanted]
-        python = [e for e in python if everything or Path(e["path"]).stem in wanted]
     return {"user_effects": {"formulas": formulas, "python": python}} if formulas or python else {}
 
 

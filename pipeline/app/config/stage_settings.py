@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,8 +27,6 @@ from pipeline.output.history import digest
 from pipeline.unit import EFFECTS_STAGE, STEPS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
     from pipeline.app.config.campaign import Campaign, UnitRow
 
 PACKAGE = Path(__file__).resolve().parents[2]
@@ -156,15 +155,12 @@ def _content(
     if stage in ("ingest", "report"):
         content["campaign"] = campaign.name
     if stage == "ingest":
-        content |= {"directory": str(campaign.recorded), "recordings": _recordings(campaign, rows)}
+        content |= {"directory": str(campaign.recorded), "recordings": None}  # None: the run simulates them
+        if not campaign.simulation:
+            content["recordings"] = {
+                r.name: state_of_recordings(r.config.procedure, r.config.ingest, campaign.folder(r.name)) for r in rows
+            }
     return content
-
-
-def _recordings(campaign: Campaign, rows: Sequence[UnitRow]) -> dict[str, str] | None:
-    """Return the state of the recordings of each unit; None if the run simulates them."""
-    if campaign.simulation:
-        return None
-    return {r.name: state_of_recordings(r.config.procedure, r.config.ingest, campaign.folder(r.name)) for r in rows}
 
 
 def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:

@@ -53,10 +53,7 @@ MIN_DIFFERENT_COUNTS = 10  # least number of different integers that indicates r
 
 
 class LogChecks:
-    """Statistics of a log, collected block by block in limited memory.
-
-    ``compensated``: evidence that the log is already compensated; else empty. ``calibrated_range``: of the calibration.
-    """
+    """Statistics of a log, collected block by block in limited memory; ``calibrated_range``: of the calibration."""
 
     def __init__(self, calibrated_range: Mapping[str, float | list[float]] | None = None) -> None:
         self.samples = self.reversed = self.repeated = self.window_count = 0
@@ -64,9 +61,8 @@ class LogChecks:
         self.last_time = -np.inf
         self.windows: list[dict[str, Values]] = []
         self.whole: dict[str, bool] = {}
-        self.compensated = ""
-        limits = {key: v if isinstance(v, list) else [-np.inf, v] for key, v in (calibrated_range or {}).items()}
-        self.ranges = {key: (low, high) for key, (low, high) in limits.items()}
+        self.compensated = ""  # evidence that the log is already compensated
+        self.ranges = {key: v if isinstance(v, list) else [-np.inf, v] for key, v in (calibrated_range or {}).items()}
         self.soaked = self.ranges.pop(SOAKED, None)  # the temperatures within which a soak determined the bias
         if self.soaked:
             self.ranges[TEMPERATURE_RANGE] = self.soaked
@@ -120,7 +116,6 @@ class LogChecks:
         self._add_windows(raw, calibrated, time)
 
     def _add_extremes(self, raw: Mapping[str, Values], temperature: Values | None) -> None:
-        """Count the samples beyond the calibrated range."""
         values = {RANGES[s]: np.linalg.norm(v, axis=1) for s, v in raw.items()}
         values |= {} if temperature is None else {TEMPERATURE_RANGE: temperature}
         for key in values.keys() & self.ranges.keys():
@@ -132,7 +127,6 @@ class LogChecks:
                 self.extremes[key] = [count + len(beyond), min(least, beyond.min()), max(most, beyond.max())]
 
     def _beyond(self, calibrated: set[str]) -> list[str]:
-        """Return warnings about samples beyond the calibrated range."""
         warnings = []
         for key, (count, least, most) in sorted(self.extremes.items()):
             low, high = self.ranges[key]

@@ -10,6 +10,7 @@ As in a running system, a message is compensated with the temperatures before it
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,13 +23,11 @@ from imu_logs.message_decoder import MAPPED, TopicDecoder, Topics, listed_topics
 from imu_logs.profile import McapFormat, mcap_format
 from imu_logs.units import ACCELEROMETER, GYROSCOPE, SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.core.errors import IngestError, InputError
+from pipeline.core.records import Integers, Values
 from pipeline.physics.measurement import ExponentialRegression
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pipeline.app.field_logs.stream import LogProfile, LogStream, Output, Result
-    from pipeline.core.records import Integers, Values
 
 
 LAST_ID = 0xFFFF  # ids of added definitions count down from here, because recorders count up from 0

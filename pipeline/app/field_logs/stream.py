@@ -66,14 +66,12 @@ LOG_FORMATS = {".mcap": "MCAP", ".csv": "text", ".txt": "text"}
 
 @dataclass(frozen=True)
 class LogProfile:
-    """The layout of the logs of a unit.
-
-    ``ingest``: the ingest profile, by default the canonical one. ``axis_maps``: sensor to the body axes along which its
-    reading axes point, by default +x, +y, +z.
-    """
+    """The layout of the logs of a unit."""
 
     ingest: Ingest = CANONICAL_CSV
-    axis_maps: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    axis_maps: Mapping[str, Sequence[str]] = field(
+        default_factory=dict
+    )  # sensor to the body axes that its axes point along
 
     @classmethod
     def of_calibration(cls, document: Mapping[str, Any], file: str) -> LogProfile:
@@ -141,18 +139,14 @@ class CalibratedStretch:
 
 @dataclass
 class Result:
-    """The result of the compensation with the calibration of ``unit``.
-
-    ``topic``: of the calibrated messages in an MCAP log. ``notes``: facts about the output. ``warnings``: signs that
-    the calibration does not belong to the log.
-    """
+    """The result of the compensation with the calibration of ``unit``."""
 
     unit: str
     samples: int = 0
     sensors: list[str] = field(default_factory=list)
-    topic: str = ""
-    notes: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
+    topic: str = ""  # of the calibrated messages in an MCAP log
+    notes: list[str] = field(default_factory=list)  # facts about the output
+    warnings: list[str] = field(default_factory=list)  # signs that the calibration does not belong to the log
 
 
 class LogStream:

@@ -197,9 +197,8 @@ def merge_common(content: dict[str, Any]) -> dict[str, Any]:
 
     The order of keys, and with it of recordings, is alphabetical, whatever other units of the batch have in common.
     """
-    content["units"] = {unit: _merged(content.get("common", {}), own) for unit, own in content.get("units", {}).items()}
-    content.pop("common", None)
-    return content
+    common = content.pop("common", {})
+    return content | {"units": {unit: _merged(common, own) for unit, own in content.get("units", {}).items()}}
 
 
 def _merged(common: dict[str, Any], unit_settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ distribution for 95 %. Without a stated seat, and without fitted mountings, noth
 from __future__ import annotations
 
 import platform
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -43,7 +44,7 @@ from pipeline.core.records import (
     calibrated,
     coverage_factor,
 )
-from pipeline.core.settings import Settings
+from pipeline.core.settings import Board, DataSheet, Settings
 from pipeline.estimation.candidates import MOUNTING
 from pipeline.estimation.chips import Chip, chip_document
 from pipeline.estimation.noise_identification import identify_noise
@@ -52,10 +53,7 @@ from pipeline.output.exports import exports
 from pipeline.physics.statements import beyond_limits, implausible, limited, not_determined, with_open
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from pipeline.app.steps.batch import Job
-    from pipeline.core.settings import Board, DataSheet, Settings
 
 
 NORMAL_FACTOR = float(coverage_factor(np.inf))
@@ -238,7 +236,6 @@ def _software() -> dict[str, str]:
 
 
 def _missing_s(recording: Recording) -> float:
-    """Return the time in gaps of a recording, s."""
     rows = np.flatnonzero(recording.flags & GAP) if recording.flags is not None else np.zeros(0, int)
     rows = rows[rows > 0]
     return round(float(np.sum(recording.time[rows] - recording.time[rows - 1] - recording.interval)), 6)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.app.steps.unit_files import StoredUnit
 from pipeline.core.errors import omission
+from pipeline.core.pack import Files
 from pipeline.core.records import (
     SCHEMA_VERSION,
     Fit,
@@ -30,11 +31,7 @@ from pipeline.evaluation.held_out.samples import OTHER_SENSOR
 from pipeline.evaluation.held_out.validation import validate
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from pipeline.app.steps.batch import Job
-    from pipeline.core.pack import Files
-    from pipeline.core.settings import Settings
 
 
 def validate_unit(unit: str, recordings: UnitRecordings, fits: Mapping[str, Fit], settings: Settings) -> Validation:

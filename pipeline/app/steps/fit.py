@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from pipeline.checks.reference_scale import rate_error
 from pipeline.core.errors import CannotCalibrateError
 from pipeline.core.records import Fit, NotCalibrated, UnitRecordings
+from pipeline.core.settings import Settings
 from pipeline.estimation.stages import GIVEN, fit_stage
 from pipeline.estimation.stated_lines import with_stated
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from pipeline.app.steps.batch import Job
-    from pipeline.core.settings import Settings
 
 
 def fit_reads(job: Job, unit: str, settings: Settings) -> str:  # noqa: ARG001

@@ -29,7 +29,7 @@ from pipeline.core import VERSION
 from pipeline.core.errors import PipelineError, failure_of
 from pipeline.core.files import JSON, flushed_together, read_json, write_atomically, write_json, write_new
 from pipeline.core.pack import PACKED_STEPS, PACKS, WITH_PRIOR, Batch, Pack, as_bytes, batches_of, is_published
-from pipeline.core.verdicts import READY, kinds_of
+from pipeline.core.verdicts import READY, state_of
 from pipeline.ingest.files import digests_in_pack
 from pipeline.output.history import of_units, record
 from pipeline.output.pages.campaign_page import render
@@ -178,7 +178,7 @@ def _write_campaign(job: Job, units: Mapping[str, JSON], parameters: pd.DataFram
     failures = [u["failure"] for u in units.values() if u["failure"]]
     statistics = _statistics(job, units, parameters, new)
     for row in rows:
-        row["state"] = next(iter(kinds_of(row)), READY)
+        row["state"] = next(iter(state_of(row).kinds), READY)
     write_summary(new / "summary.csv", rows)
     write_json(new / "failures.json", failures)
     write_parameters(new / "parameters.parquet", rows, parameters)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,14 +21,10 @@ from pipeline.ingest.files import candidate_files, recording_files, state_of_rec
 from pipeline.ingest.read import read_recordings
 from pipeline.physics.signal.filters import apply_filter
 from pipeline.physics.signal.segments import cut, held_out_windows, logged_turns
+from pipeline.unit import UnitFiles
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
     from pipeline.app.steps.batch import Job
-    from pipeline.core.records import Recording
-    from pipeline.core.settings import Settings
-    from pipeline.unit import UnitFiles
 
 
 def collect_batch(job: Job) -> None:

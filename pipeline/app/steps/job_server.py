@@ -136,9 +136,8 @@ class Request(NamedTuple):
             os.close(stream)
 
 
-NewProcess = tuple[
-    Request, socket.socket | None
-]  # with the channel by which the process gets the next jobs of its batch
+# What a new process runs, with the channel by which it gets the next jobs of its batch.
+NewProcess = tuple[Request, socket.socket | None]
 
 
 class Processes:
@@ -272,7 +271,6 @@ def _run_job(run_command: Callable[[list[str]], int], request: Request) -> int:
 
 
 def _resident_bytes() -> int:
-    """Return the memory of this process."""
     pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
     return int(pages) * os.sysconf("SC_PAGE_SIZE")
 

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.app.steps.calibration import header, inputs
 from pipeline.app.steps.unit_files import recordings_of
-from pipeline.core.records import SENSORS
+from pipeline.core.pack import Files
+from pipeline.core.records import SENSORS, UnitRecordings
+from pipeline.core.settings import Settings
 from pipeline.estimation.rest_means import rests_by_use
 from pipeline.evaluation.diagnosis.words import in_words
 from pipeline.output.pages.certificate import certificate, certificate_page, digital_certificate
@@ -16,9 +18,6 @@ from pipeline.output.pages.unit_page import render, sensor_temperature
 
 if TYPE_CHECKING:
     from pipeline.app.steps.batch import Job
-    from pipeline.core.pack import Files
-    from pipeline.core.records import UnitRecordings
-    from pipeline.core.settings import Settings
 
 
 def report(

@@ -8,6 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.core.errors import PipelineError
+from pipeline.core.files import JSON
+from pipeline.core.pack import Files, Pack
 from pipeline.core.settings import Sensor, Settings, Stated
 from pipeline.ingest.files import digests_of_entries
 from pipeline.output.history import unit_state
@@ -16,8 +18,6 @@ from pipeline.output.pages.parameters import sheet_columns, summary_row, unit_pa
 
 if TYPE_CHECKING:
     from pipeline.app.steps.batch import Job
-    from pipeline.core.files import JSON
-    from pipeline.core.pack import Files, Pack
 
 KEPT = ("schema_version", "sensor", "table", "procedure", "method", "config_sha256", "software")
 

@@ -6,6 +6,7 @@ read. A job takes it from there if the pack of the earlier job has the members t
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,8 +16,6 @@ from pipeline.ingest.arrow import from_parquet, to_parquet
 from pipeline.unit import STEPS, UnitFiles
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
     from pipeline.app.steps.batch import Job
 
 Result = TypeVar("Result")
@@ -105,9 +104,8 @@ class StoredUnit:
     @property
     def checked(self) -> list[Recording]:
         """Recordings as ingest returned them."""
-        pack = self.job.inputs["ingest"]
-        name = f"{self.unit}.parquet"
-        return self._kept("ingest", "checked", lambda: from_parquet(pack.read(name), str(pack.path)))
+        packs = {"ingest": self.job.inputs["ingest"]}
+        return self._kept("ingest", "checked", lambda: recordings_of(packs, self.unit))
 
     @property
     def recordings(self) -> UnitRecordings:

@@ -264,9 +264,7 @@ class StageResult:
     name: str
     parameters: Mapping[str, Estimate] = field(default_factory=dict)
     residual_rms: float | None = None  # of the error that the fit minimises, after this stage, unit of the sensor
-    correction: tuple[CorrectionStep, ...] | None = (
-        None  # of readings after this stage, if it is more than matrix and bias
-    )
+    correction: tuple[CorrectionStep, ...] | None = None  # of readings after it, if it is more than matrix and bias
     details: StageDetails = field(default_factory=StageDetails)
 
     def to_json(self) -> dict[str, Any]:
@@ -293,15 +291,11 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class FittedEffect:
-    """A fitted effect.
-
-    ``definition`` is the content of the file of a user's effect, so that the calibration can be applied without that
-    file; None for a built-in effect.
-    """
+    """A fitted effect."""
 
     name: str
     parameters: Mapping[str, Coefficient]
-    definition: dict[str, Any] | None = None
+    definition: dict[str, Any] | None = None  # content of the file of a user's effect, to be applied without the file
 
     @property
     def values(self) -> Values:

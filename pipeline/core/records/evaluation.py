@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from imu_logs.units import SENSORS
 from pipeline.core.records.budget import Estimate, as_json, with_arrays
 from pipeline.core.records.calibration import SCHEMA_VERSION
 from pipeline.core.records.recording import Noise
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.verdicts import Verdict
-
+from pipeline.core.verdicts import Verdict
 
 FEWEST_MOVES = 6  # held-out moves whose mean error counts; of fewer, the error weighted by its covariance
 NOISE_AS_PUBLISHED = {  # of a published validation: field of ``Noise``

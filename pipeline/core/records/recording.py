@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, wraps
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 ReturnedQuantity = TypeVar("ReturnedQuantity")
 Arguments = ParamSpec("Arguments")
+OfRecording: TypeAlias = "Callable[Concatenate[Recording, Arguments], ReturnedQuantity]"
 STRAIGHT = ("+x", "+y", "+z")
 
 BETWEEN_ATTITUDES_S = 1000.0  # between the blocks of a file of attitudes, whose times are not known
@@ -78,15 +79,11 @@ class Quantities(dict["tuple[Hashable, ...]", Any]):
 
 @dataclass(frozen=True)
 class Recording:
-    """The samples of one recording.
-
-    ``role``: ``accelerometer`` or ``gyroscope`` (turns for that sensor), ``rests`` (rests and moves without a table),
-    ``validation`` (held out from every fit) or ``static`` (determines the noise model). ``filter``: name and settings
-    of the applied filter; ``delay_s`` of its output (0 if it is zero-phase); ``noise_gain``, its factor on the standard
-    deviation of white noise.
-    """
+    """The samples of one recording."""
 
     name: str  # in the procedure, for example accel_x
+    # ``accelerometer`` or ``gyroscope`` (turns for that sensor), ``rests`` (rests and moves without a table),
+    # ``validation`` (held out from every fit) or ``static`` (determines the noise model)
     role: str
     axis: str | None  # body axis of the table's turns (x, y, z), None without a single axis
     time_ns: Integers  # (n,), ns since power-on
@@ -99,6 +96,7 @@ class Recording:
     flags: NDArray[np.uint16] | None = None  # (n,), bit 0: a gap before this sample, 1: clipped, 2: stuck, 3: repaired
     source: dict[str, Any] = field(default_factory=dict)  # of the input: file, sha256, rows
     notes: tuple[Note, ...] = ()
+    # the applied filter: name, settings, delay of its output (0 if it is zero-phase), factor on white noise
     filter: dict[str, Any] = field(default_factory=lambda: {"name": "none", "delay_s": 0.0, "noise_gain": 1.0})
     clock_shared: bool = True  # whether the time between this recording and the unit's others is known
     setup: str = ""  # table, mounting or session of the recording; empty if the unit has only one
@@ -130,36 +128,31 @@ class Recording:
         return float(median(np.diff(self.time_ns))) / SECOND_NS if self.samples > 1 else float("nan")
 
     @cached_property
-    def _quantities(self) -> Quantities:
+    def of_readings(self) -> Quantities:
         """The quantities that are declared ``once``, by function and arguments."""
         return Quantities()
 
     @cached_property
-    def _quantities_of_log(self) -> Quantities:
-        """Those that are declared ``once_of_log``."""
+    def of_log(self) -> Quantities:
+        """Those that are declared ``once_of_log``; those of several recordings are with the log of the first."""
         return Quantities()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what is copied to another process: not the quantities, which contain functions."""
-        return {name: value for name, value in vars(self).items() if not name.startswith("_quantities")}
-
-    @property
-    def results(self) -> Quantities:
-        """What is kept with the log; of several recordings, with that of the first."""
-        return self._quantities_of_log
+        return {name: value for name, value in vars(self).items() if name not in {"of_readings", "of_log"}}
 
     def with_readings(self, **fields: Any) -> Self:  # noqa: ANN401  (of the dataclass)
         """Return the recording with other readings, flags, filter or role, and the same quantities of its log."""
         changed = replace(self, **fields)
-        vars(changed)["_quantities_of_log"] = self._quantities_of_log
+        vars(changed)["of_log"] = self.of_log
         return changed
 
     def with_source(self, source: dict[str, Any], *unread: Callable[..., object]) -> Self:
         """Return the recording with other names of its files; ``unread``: quantities that are no longer kept."""
         changed = object.__new__(type(self))
-        known = (self._quantities, self._quantities_of_log)
-        mine, of_log = (Quantities({k: v for k, v in of.items() if k[0] not in unread}) for of in known)
-        vars(changed).update(vars(self), source=source, _quantities=mine, _quantities_of_log=of_log)
+        known = {"of_readings": self.of_readings, "of_log": self.of_log}
+        kept = {name: Quantities({k: v for k, v in of.items() if k[0] not in unread}) for name, of in known.items()}
+        vars(changed).update(vars(self), source=source, **kept)
         return changed
 
     @property
@@ -205,29 +198,24 @@ class Same:
         return isinstance(other, Same) and self.value is other.value
 
 
-def once(
-    compute: Callable[Concatenate[Recording, Arguments], ReturnedQuantity],
-) -> Callable[Concatenate[Recording, Arguments], ReturnedQuantity]:
+def once(compute: OfRecording[Arguments, ReturnedQuantity]) -> OfRecording[Arguments, ReturnedQuantity]:
     """Declare a quantity of a recording: it follows from the recording and further arguments, which have a hash.
 
     The function computes it at the first call, and the recording keeps it. The steps of a unit pass on its recordings
     (``UnitRecordings``), so that each motion of the table, smoothed temperature, list of rests and row of a fit is
     computed once a unit. Callers must not change it.
     """
-    return _kept(compute, lambda recording: recording._quantities)  # noqa: SLF001
+    return _kept(compute, lambda recording: recording.of_readings)
 
 
-def once_of_log(
-    compute: Callable[Concatenate[Recording, Arguments], ReturnedQuantity],
-) -> Callable[Concatenate[Recording, Arguments], ReturnedQuantity]:
+def once_of_log(compute: OfRecording[Arguments, ReturnedQuantity]) -> OfRecording[Arguments, ReturnedQuantity]:
     """Declare a quantity as ``once`` that depends on no readings, flags, filter or role (``with_readings``)."""
-    return _kept(compute, lambda recording: recording._quantities_of_log)  # noqa: SLF001
+    return _kept(compute, lambda recording: recording.of_log)
 
 
 def _kept(
-    compute: Callable[Concatenate[Recording, Arguments], ReturnedQuantity],
-    quantities: Callable[[Recording], Quantities],
-) -> Callable[Concatenate[Recording, Arguments], ReturnedQuantity]:
+    compute: OfRecording[Arguments, ReturnedQuantity], quantities: Callable[[Recording], Quantities]
+) -> OfRecording[Arguments, ReturnedQuantity]:
     @wraps(compute)
     def quantity(recording: Recording, /, *arguments: Arguments.args, **named: Arguments.kwargs) -> ReturnedQuantity:
         key = quantity, arguments, *sorted(named.items())
@@ -255,26 +243,23 @@ class WanderLikelihood:
 class Noise:
     """White noise of a sample (before any filter) and Gauss-Markov bias wander: (3,) standard deviations.
 
-    ``source``, ``wander_source`` and ``time_source`` name the source of the white noise, the wander and its correlation
-    time: ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (scatter of windows of 16 samples in
-    turns about a local polynomial) or ``data_sheet`` (the sensor file). ``length`` is the duration, s, of the static
-    rest, or of all rests by hand that show the wander, else 0; the relative uncertainty of the wander is about
-    ``sqrt(correlation_time / length)``. ``likelihood`` is None without a static recording. ``step``: of the readings of
-    each axis, where it hides the noise (``pipeline.physics.signal.quiet_motion.rounding_of``); else None. ``rounding``:
-    the standard uncertainty of means by these steps.
+    A source is ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (scatter of windows of 16 samples
+    in turns about a local polynomial) or ``data_sheet`` (the sensor file).
     """
 
     white: Values
     wander: Values
-    correlation_time: float
-    source: str
+    correlation_time: float  # s
+    source: str  # of the white noise
     wander_source: str = "data_sheet"
-    time_source: str = "data_sheet"
+    time_source: str = "data_sheet"  # of the correlation time
+    # s, of the static rest, or of all rests by hand that show the wander, else 0; the wander has a relative uncertainty
+    # of about ``sqrt(correlation_time / length)``
     length: float = 0.0
-    likelihood: WanderLikelihood | None = None
+    likelihood: WanderLikelihood | None = None  # None without a static recording
     # each (3,), 0 for an axis whose readings are finer than its noise
-    step: Values | None = None
-    rounding: Values | None = None
+    step: Values | None = None  # of the readings that hide the noise (``pipeline.physics.signal.quiet_motion``)
+    rounding: Values | None = None  # standard uncertainty of means by these steps
 
     def to_json(self) -> dict[str, Any]:
         """Return the noise as JSON values."""

@@ -19,8 +19,8 @@ from pipeline.core.verdicts import (
     Verdict,
     css_class,
     error_of,
-    kinds_of,
     moves_over_noise,
+    state_of,
     turn_errors,
 )
 from pipeline.output.outcome import apply_command, as_overrides, commands_of, found_mountings, place, run_command
@@ -104,7 +104,7 @@ def render(
     page: str = template("unit.html").render(
         calibration=calibration,
         ok=ok,
-        problems=kinds_of(row | {"incomplete": "; ".join(f"{r['stage']}: {r['message']}" for r in incomplete)}),
+        problems=state_of(row | {"incomplete": "; ".join(f"{r['stage']}: {r['message']}" for r in incomplete)}).kinds,
         kinds=KINDS,
         apply=apply_command(settings.stated.run, str(calibration.get("unit"))) if ok and settings.stated.run else None,
         passed=passes(calibration, validation),
