@@ -38,7 +38,7 @@ from pipeline.checks.at_rest import check_axes, check_static, with_rates_at_rest
 from pipeline.checks.evidence import place, refusal
 from pipeline.checks.mounting import check_mounting
 from pipeline.checks.reference import check_motion, check_turns
-from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Note, Recording, Values, finite_rows
+from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Note, Recording, Values, ends_of_runs, finite_rows
 from pipeline.core.settings import Settings, Table
 from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.physics.kinematics import normal_gravity_g
@@ -344,16 +344,15 @@ def _check_pair(one: Recording, two: Recording, first: Index, second: Index) -> 
     first, second = first[order], second[order]
     common, longest = len(first), max(one.samples, two.samples)
     ahead = (np.diff(first) <= APART) & (np.diff(second) > 0) & (np.diff(second) <= APART)
-    edges = np.flatnonzero(np.diff(ahead, prepend=False, append=False))
-    if not edges.size:
+    starts, stops = ends_of_runs(ahead)
+    if not starts.size:
         return
-    lengths = edges[1::2] - edges[::2] + 1
-    best = int(np.argmax(lengths))
-    count = int(lengths[best])
+    best = int(np.argmax(stops - starts))
+    a, b = int(starts[best]), int(stops[best])
+    count = b - a + 1
     chance = APART * common / longest
     if count < MIN_STEP_ROWS or (count < common / 2 and chance < 1.0 and chance ** (count - 1) > EXPECTED_CHANCE_RUNS):
         return
-    a, b = int(edges[2 * best]), int(edges[2 * best + 1])
     late, early = (two, one) if two.role == "validation" or one.role != "validation" else (one, two)
     spans = {one.name: (first[a], first[b]), two.name: (second[a], second[b])}
     rows, copied = (place(r, int(spans[r.name][0]), int(spans[r.name][1])) for r in (late, early))

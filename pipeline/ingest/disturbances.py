@@ -40,6 +40,7 @@ from pipeline.core.records import (
     Recording,
     Values,
     continuous,
+    ends_of_runs,
     level_in_body,
     median,
     noise_of_steps,
@@ -297,9 +298,7 @@ def _pieces(recording: Recording) -> Index:
         return none
     size = max(MIN_PIECE_SAMPLES, round(PIECE_S / recording.interval))
     settling = int(np.ceil(SETTLING_S / recording.interval))
-    padded = np.zeros(len(still) + 2, bool)
-    padded[1:-1] = still
-    rests = np.flatnonzero(padded[1:] != padded[:-1]).reshape(-1, 2)
+    rests = np.stack(ends_of_runs(still), axis=1)
     rests = rests[rests[:, 1] - rests[:, 0] >= MIN_PIECE_SAMPLES + 2 * settling]
     length = rests[:, 1] - rests[:, 0] - 2 * settling
     parts = -(-length // size)

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from imu_logs.units import SENSORS
+from imu_logs.units import SENSOR_UNITS, SENSORS
 from pipeline.core.errors import shortened
 from pipeline.core.files import INSTALLED, JSON, read_json, text_of_cell
 from pipeline.core.verdicts import (
@@ -37,7 +37,6 @@ from pipeline.output.history import difference, dropped, errors_of, of_units, re
 
 Ways = Sequence[Sequence[str]]
 
-SENSOR_UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 ZERO_SETTING = re.compile(r"(?<=zero_deg=)-?[0-9.]+")
 ALIKE_DEG = 0.1  # gravity shows a zero to some hundredths of a degree (docs/mounting.md, What is checked)
 NAMED_PER_LINE = 5  # units that a line names, and lines of one kind

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.interpolate import BSpline
 
-    from imu_logs.log import Integers, Mask, Note, Values
+    from imu_logs.log import Index, Integers, Mask, Note, Values
     from pipeline.core.settings import Sensor
 
 ReturnedQuantity = TypeVar("ReturnedQuantity")
@@ -413,6 +413,14 @@ def motion_at_rest(time: NDArray[np.float64]) -> Motion:
     zeros = np.zeros((len(time), 3))
     still = np.ones(len(time), bool)
     return Motion(time, zeros, zeros, zeros, zeros, None, None, None, None, still)
+
+
+def ends_of_runs(mask: Mask) -> tuple[Index, Index]:
+    """Return where the runs of True in a mask start and stop."""
+    padded = np.zeros(len(mask) + 2, bool)
+    padded[1:-1] = mask
+    edges = np.flatnonzero(padded[1:] != padded[:-1])
+    return edges[::2], edges[1::2]
 
 
 def finite_rows(values: Values) -> Mask:
