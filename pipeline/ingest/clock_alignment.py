@@ -51,7 +51,7 @@ import numpy as np
 from imu_logs.log import Log, Note
 from imu_logs.units import ATTITUDE, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError
-from pipeline.core.records import Index, Mask, Values, continuous, level_in_body, rotation_deg
+from pipeline.core.records import Index, Mask, Values, continuous, level_in_body, quintic_spline, rotation_deg
 from pipeline.core.settings import ProgramRest, ProgramTurn, Repeated
 
 ENCODER_STEP_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
@@ -179,9 +179,7 @@ def interpolators(log: Log) -> dict[str, Callable[[Values], Values]]:
         cubic = CubicHermiteSpline(log_time, angle, slope)
         out["table_angle"] = lambda tau: cubic(np.clip(tau, log_time[0], log_time[-1]))
     if ATTITUDE[0] in values:
-        from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by attitude logs alone)
-
-        spline = make_interp_spline(log_time, continuous(np.column_stack([values[c] for c in ATTITUDE])), k=5)
+        spline = quintic_spline(log_time, continuous(np.column_stack([values[c] for c in ATTITUDE])))
         for index, channel in enumerate(ATTITUDE):
             out[channel] = lambda tau, i=index: _unit(spline(np.clip(tau, 0.0, log_time[-1])))[:, i]  # type: ignore[misc]
     return out
