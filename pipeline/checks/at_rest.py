@@ -127,7 +127,7 @@ def _doubted(
                     f"file allows {most:.3g}: is the static recording of this unit?"
                 )
     notes = [Note("N-REFERENCE", recording.samples, 0, 0, detail) for detail in details]
-    return replace(recording, notes=(*recording.notes, *notes))
+    return recording.noted(*notes)
 
 
 def _digit(reading: Values) -> Values:
@@ -189,7 +189,7 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_model:
     t = recording.time
     detail = f"only {place(recording, start, stop - 1)} are used of {t[0]:.6g} to {t[-1]:.6g} s: the rest moves; {why}"
     note = Note("N-MOVED", left_out, 0, 0, detail, float(t[0]), float(t[-1]))
-    return replace(recording.select(slice(start, stop)), notes=(*recording.notes, note))
+    return recording.select(slice(start, stop)).noted(note)
 
 
 def _moving(recording: Recording, sensor: str, sheet: DataSheet, rests: Values) -> tuple[Mask, str]:

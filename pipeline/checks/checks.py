@@ -84,8 +84,7 @@ def refined(recordings: Sequence[Recording]) -> list[Recording]:
     out = []
     for r in recordings:
         note = Note("N-STEPS", r.samples, 0, r.samples, f"{r.name}: {detail}")
-        fine = np.interp(r.time, nodes, curve)
-        out.append(replace(r, temperature=fine, notes=(*r.notes, note)))
+        out.append(replace(r.noted(note), temperature=np.interp(r.time, nodes, curve)))
     return out
 
 
@@ -204,7 +203,7 @@ def check_recordings(recordings: Sequence[Recording], settings: Settings) -> lis
     """
     _check_shared_rows(recordings)
     check_axes(recordings)
-    recordings = _with_settling(_with_steps(with_rates_at_rest(recordings)))
+    recordings = [*map(_with_settling, _with_steps(with_rates_at_rest(recordings)))]
     turns, delays = check_turns(check_static(recordings, settings), settings)
     checked = refined(check_motion(check_mounting(turns, settings), delays, settings))
     return _placed(checked, settings.table)
@@ -227,29 +226,25 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
                 "smaller range"
             )
             k, first = next((k, r) for k, r in enumerate(noted) if r.reading(sensor) is not None)
-            noted[k] = replace(first, notes=(*first.notes, Note(RESOLUTION_NOTE, first.samples, 0, 0, detail)))
+            noted[k] = first.noted(Note(RESOLUTION_NOTE, first.samples, 0, 0, detail))
     return noted
 
 
-def _with_settling(recordings: Sequence[Recording]) -> Sequence[Recording]:
+def _with_settling(recording: Recording) -> Recording:
     """Note an accelerometer that settles in the rests by hand, with the time that is left out or would be needed."""
-    noted = list(recordings)
-    for k, recording in enumerate(recordings):
-        by_hand = recording.role in {"rests", "validation"} and recording.logged_rate is None
-        settling = settling_of(recording) if by_hand else None
-        if settling is None:
-            continue
-        detail = f"after moves the accelerometer settles with a time constant of {settling.time_s:.2g} s,"
-        detail += f" as with a slow filter; it is settled {settling.left_out_s:.2g} s after a rest was found"
-        detail += (
-            f", and the rests are too short for that: their means are off by {settling.left_g:.2g} g. Rest longer, or "
-            "log without this filter"
-            if settling.clear
-            else ", and this time is left out of every rest"
-        )
-        note = Note("N-REFERENCE" if settling.clear else "N-SETTLING", recording.samples, 0, 0, detail)
-        noted[k] = replace(recording, notes=(*recording.notes, note))
-    return noted
+    by_hand = recording.role in {"rests", "validation"} and recording.logged_rate is None
+    settling = settling_of(recording) if by_hand else None
+    if settling is None:
+        return recording
+    detail = f"after moves the accelerometer settles with a time constant of {settling.time_s:.2g} s,"
+    detail += f" as with a slow filter; it is settled {settling.left_out_s:.2g} s after a rest was found"
+    detail += (
+        f", and the rests are too short for that: their means are off by {settling.left_g:.2g} g. Rest longer, or "
+        "log without this filter"
+        if settling.clear
+        else ", and this time is left out of every rest"
+    )
+    return recording.noted(Note("N-REFERENCE" if settling.clear else "N-SETTLING", recording.samples, 0, 0, detail))
 
 
 def _is_whole(value: float) -> bool:
@@ -261,7 +256,7 @@ def _placed(recordings: list[Recording], table: Table) -> list[Recording]:
     latitude, azimuth = table.latitude_deg, table.azimuth_deg
     if latitude is None:
         return recordings
-    gravity, notes = normal_gravity_g(float(latitude)), []
+    gravity = normal_gravity_g(float(latitude))
     measured = [k for k, r in enumerate(recordings) if r.accelerometer is not None]
     if measured and table.gravity_g == 1.0 and abs(gravity - 1.0) >= SAME_GRAVITY_G:
         detail = (
@@ -269,15 +264,14 @@ def _placed(recordings: list[Recording], table: Table) -> list[Recording]:
             "and 0.000315 g less for each km of height. Scale and bias of the accelerometer are then in units of local "
             f"gravity, {abs(gravity - 1.0):.3%} off standard g: set table.gravity_g={gravity:.5f} for standard g"
         )
-        notes.append((measured[0], Note("N-GRAVITY", 1, 0, 0, detail)))
+        recordings[measured[0]] = recordings[measured[0]].noted(Note("N-GRAVITY", 1, 0, 0, detail))
     turns = [(k, r) for k, r in enumerate(recordings) if r.axis and not r.up and r.role != "validation"]
     if turns and table.azimuth_of == "turn_axis" and azimuth is not None:
         ends = [f"body {r.axis} to {(azimuth + 90.0 * (1 - r.sense)) % 360.0:g} deg in {r.name}" for _, r in turns]
         detail = "Earth's rotation is in the model: by table.azimuth_deg and the sense of the encoder the shaft points"
         detail += f" with {', '.join(ends)}, clockwise from north; if it does not, correct table.azimuth_deg by 180 deg"
-        notes.append((turns[0][0], Note("N-AZIMUTH", len(turns), 0, 0, detail)))
-    for k, note in notes:
-        recordings[k] = replace(recordings[k], notes=(*recordings[k].notes, note))
+        k, first = turns[0]
+        recordings[k] = first.noted(Note("N-AZIMUTH", len(turns), 0, 0, detail))
     return recordings
 
 

@@ -205,7 +205,7 @@ def _turned_attitude(recording: Recording) -> Recording:
     names = ", ".join(nearest_axis(row) for row in F)
     detail = f"the attitude is turned to the axes of the unit: the table's x, y and z are body {names}"
     note = Note("N-FOUND", recording.samples, 0, 0, detail)
-    return replace(recording, table_attitude=np.asarray(attitude, np.float64), notes=(*recording.notes, note))
+    return replace(recording.noted(note), table_attitude=np.asarray(attitude, np.float64))
 
 
 def _negated(turns: Sequence[TurnRecording], tolerance: float) -> bool:
@@ -235,13 +235,13 @@ def _applied(
     """
     recording, bench = turn.recording, turn.stated
     angle, rate = recording.table_angle, recording.table_rate
-    notes = [*recording.notes, *([doubt] if doubt else [])]
+    notes = [doubt] if doubt else []
     logged = angle is not None and recording.accelerometer is not None
     if turn.fit.unknown and logged and recording.role != "gyroscope":  # that needs neither face nor zero
         detail = f"upward face, turn axis and zero are taken as stated: {turn.fit.unknown}"
         notes.append(Note("N-MOUNTING", 1, 0, 0, detail))
     if bench.conventional and not as_found:
-        return replace(recording, notes=tuple(notes)) if len(notes) > len(recording.notes) else recording
+        return recording.noted(*notes) if notes else recording
     detail = f"{as_found or 'as stated'}, {words(bench)}:"
     detail += f" the angle used is {bench.sense:+d} times the logged one, {bench.offset:+.6g} deg"
     if bench.vertical:
@@ -250,7 +250,7 @@ def _applied(
     notes.append(Note(code, recording.samples, 0, 0, detail, settings=settings))
     angle = None if angle is None else bench.sense * angle + bench.offset
     rate, up = None if rate is None else bench.sense * rate, bench.up if bench.vertical else ""
-    return replace(recording, up=up, sense=bench.sense, table_angle=angle, table_rate=rate, notes=tuple(notes))
+    return replace(recording.noted(*notes), up=up, sense=bench.sense, table_angle=angle, table_rate=rate)
 
 
 def words(bench: TurnMounting) -> str:

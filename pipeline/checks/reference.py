@@ -326,8 +326,7 @@ def check_motion(recordings: Sequence[Recording], delays: Mapping[str, Delay], s
 def _with_notes(
     recordings: Sequence[Recording], found: Mapping[str, tuple[list[Note], Delay | None]]
 ) -> list[Recording]:
-    notes = {name: notes for name, (notes, _) in found.items() if notes}
-    return [replace(r, notes=(*r.notes, *notes[r.name])) if r.name in notes else r for r in recordings]
+    return [r.noted(*found[r.name][0]) if r.name in found and found[r.name][0] else r for r in recordings]
 
 
 class _Gyroscope:

@@ -95,7 +95,7 @@ def leave_out_disturbances(recording: Recording, note: Callable[[str, Index, str
             f"ingest.checks.disturbed_rows leaves out, so all are kept; does the bench vibrate, "
             f"or the log run on another clock? {worst}"
         )
-        return replace(recording, notes=(*recording.notes, note("N-RESTLESS", rows, detail)))
+        return recording.noted(note("N-RESTLESS", rows, detail))
     detail = f"{places} left out as glitches or knocks; {worst}"
     return without_rows(recording, rows, note("N-DISTURBED", rows, detail))
 
@@ -106,8 +106,7 @@ def without_rows(recording: Recording, rows: Index, note: Note) -> Recording:
     undisturbed[rows] = False
     flags = np.zeros(recording.samples, np.uint16) if recording.flags is None else recording.flags.copy()
     flags[np.minimum(rows + 1, recording.samples - 1)] |= GAP
-    kept = replace(recording, flags=flags).select(undisturbed)
-    return replace(kept, notes=(*kept.notes, note))
+    return replace(recording, flags=flags).select(undisturbed).noted(note)
 
 
 def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:

@@ -185,6 +185,10 @@ class Recording:
         """Return the (n, 3) readings of ``accelerometer`` (g) or ``gyroscope`` (deg/s), or None."""
         return self.accelerometer if sensor == "accelerometer" else self.gyroscope
 
+    def noted(self, *notes: Note) -> Self:
+        """Return the recording with further notes."""
+        return replace(self, notes=(*self.notes, *notes))
+
     def select(self, index: NDArray[Any] | slice) -> Self:
         """Return the recording with only the samples of ``index`` (slice, mask or integers)."""
         return replace(self, **{n: v[index] for n in OF_SAMPLES if (v := getattr(self, n)) is not None})
