@@ -59,8 +59,7 @@ class _Departure:
 def check_mounting(recordings: Sequence[Recording], settings: Settings) -> list[Recording]:
     """Return the recordings of a unit, in body axes, with the table's angle and rate by the convention.
 
-    ``IngestError``: the mounting of a turn differs from
-    the stated one and gravity does not determine it, or accelerometer and gyroscope contradict each other.
+    ``IngestError``: a mounting differs from the stated one, or accelerometer and gyroscope contradict each other.
     """
     table, sensor = settings.table, settings.sensor
     seated = table.seat_deg is not None
@@ -230,8 +229,7 @@ def _applied(
 ) -> Recording:
     """Return the recording with angle and rate by the convention, with notes on that and its doubt.
 
-    ``as_found``: the difference from the stated mounting and the hint; empty where the stated one is applied. ``ways``:
-    the settings that describe the mountings that were found.
+    ``as_found``: the difference from the stated mounting and the hint; empty where the stated one is applied.
     """
     recording, bench = turn.recording, turn.stated
     angle, rate = recording.table_angle, recording.table_rate
@@ -261,7 +259,7 @@ def words(bench: TurnMounting) -> str:
 
 
 def _departure(turn: TurnRecording, tolerance: float, lean: float) -> _Departure | None:
-    """Return the difference between the mounting of a turn and the stated one, or None."""
+    """Return the difference of a turn; ``lean``: deg, most by which the readings may show its axis off a body axis."""
     if turn.fit.vertical is not None or turn.stated.vertical:
         return _vertical(turn) or _gyroscope_sense(turn)
     return _axis(turn, tolerance, lean) or (
@@ -270,7 +268,7 @@ def _departure(turn: TurnRecording, tolerance: float, lean: float) -> _Departure
 
 
 def _axis(turn: TurnRecording, tolerance: float, lean: float) -> _Departure | None:
-    """Return the difference of the turn axis; ``lean``: deg, largest by which the readings may show it off an axis."""
+    """Return the difference of the turn axis."""
     axis, fit, name = turn.stated.axis, turn.fit, turn.name
     direction = fit.turn_axis if fit.turn_axis is not None else fit.gain
     if direction is None:

@@ -120,10 +120,7 @@ def own_rows(table: Log) -> Log:
 
 
 def unwrapped(table: Log) -> Log:
-    """Make the table's angle continuous where the encoder restarts at 0 or 360 deg.
-
-    A table turns by less than half a turn between two samples, so that a larger step is a restart of the encoder.
-    """
+    """Continue the table's angle where the encoder restarts at 0 or 360 deg: a step of more than half a turn."""
     angle = table.values.get("table_angle")
     if angle is None or len(angle) < 2:
         return table
@@ -190,10 +187,7 @@ def _unit(q: Values) -> Values:
 
 
 def _bent_line(log_time: Values, value: Values, tau: Values) -> Values:
-    """Interpolate linearly, with a bend within an interval where the lines of its two neighbours meet in it.
-
-    At a bend the slope changes by far more than elsewhere.
-    """
+    """Interpolate linearly, with a bend where the lines of both neighbours meet in an interval and differ clearly."""
     tau = np.clip(tau, log_time[0], log_time[-1])
     plain: Values = np.interp(tau, log_time, value)
     slope = np.diff(value) / np.diff(log_time)
@@ -309,10 +303,7 @@ def _places(sensed: SensorSignals, signals: Signals) -> list[float]:
 
 
 def _left(sensed: SensorSignals, signals: Signals, offset: float, *, beyond: bool) -> float:
-    """Return the mean squared residual of the whole model at an offset, relative to the noise.
-
-    It is infinite where the logs overlap by less than half of the shorter one.
-    """
+    """Return the mean squared residual over the noise; infinite if the logs share less than half of the shorter."""
     inside = signals.covers(sensed.time + offset)
     shared = float(np.mean(inside)) * sensed.time[-1]
     if shared < MIN_SHARED_DURATION * min(sensed.time[-1], signals.duration):
@@ -438,7 +429,7 @@ def _notes(sensor: Log, rows: slice, fit: ClockFit, offset_s: float) -> list[Not
 
 
 def _one_digit(value: float) -> str:
-    """Format a number with one significant digit, without exponent."""
+    """Return a number with one significant digit, without exponent."""
     return np.format_float_positional(float(f"{value:.1g}"), trim="-")
 
 
@@ -477,16 +468,13 @@ def follow_program(table: Log, program: Sequence[ProgramRest | ProgramTurn | Rep
 
 
 class Program:
-    """Commanded motion of one axis of a table: rests, and turns with a trapezoidal rate.
+    """Commanded motion of one axis of a table: rests, and turns with a trapezoidal rate; at rest before and after.
 
         A(t) = A_k + W_k s + a_k s^2 / 2,   dA/dt = W_k + a_k s,   s = t - t_k
 
     A turn by the angle D at the rate r with acceleration a ramps for r/a, holds r and ramps down; where |D| < r^2/a it
-    does not reach r, and the ramps meet in the middle. The table rests before and after the program.
-
-    ``knots``: (1 + 4 n, 4) array of time t_k
-    (s), angle A_k (deg), rate W_k (deg/s) and acceleration a_k (deg/s^2), four rows for each of n moves. ``stops``:
-    (n + 1,) array of the angles before each move and after the last, deg. ``duration``: in s.
+    does not reach r, and the ramps meet in the middle. ``knots``: (1 + 4 n, 4), t_k (s), A_k (deg), W_k (deg/s) and a_k
+    (deg/s^2), four rows for each of n moves. ``stops``: (n + 1,), deg, before each move and after the last.
     """
 
     def __init__(self, steps: Iterable[ProgramRest | ProgramTurn]) -> None:

@@ -72,8 +72,7 @@ LARGEST_SHARE = 0.1  # of the pieces
 def leave_out_disturbances(recording: Recording, note: Callable[[str, Index, str], Note], most: float) -> Recording:
     """Remove the disturbed samples of a recording, and note them by ``note``, the method of its ``Log``.
 
-    If they are more than ``most`` of the samples, none is removed, and that is noted: then the disturbance is
-    a property of the bench.
+    Of more than the share ``most``, a property of the bench, none is removed, and that is noted.
     """
     silent = recording.accelerometer is None and recording.gyroscope is None
     if silent or most == 0 or recording.samples < 4 * FEWEST_AROUND:
@@ -310,10 +309,7 @@ def _pieces(recording: Recording) -> Index:
 
 
 def _excess(readings: Values, pieces: Index) -> tuple[Values, Values]:
-    """Return the excess of each piece's chi^2 over its limit, and its scatter relative to the usual: (p, s) arrays.
-
-    ``readings``: (n, 3 s), of s sensors.
-    """
+    """Return the excess of each piece's chi^2, and its scatter over the usual, of s sensors: (n, 3 s) to (p, s)."""
     count = np.diff(pieces, axis=1).astype(float)
     bounds = pieces.ravel()
     centred = np.append(readings - readings.mean(axis=0), np.zeros((1, readings.shape[1])), axis=0)

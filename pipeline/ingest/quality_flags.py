@@ -156,8 +156,7 @@ def flag_flat_tops(table: Log, sensor: str, flags: NDArray[np.uint16]) -> list[N
 
     The range of such a sensor or logger is smaller than is stated. k repetitions are expected ``n p^k`` times by
     chance, with p as for stuck readings, of the other values. An end that a sensor may read at rest is none. Logs with
-    the motion of a table are not searched: a table may keep its largest rate, and its log contradicts a clipped
-    reading.
+    a table's motion are not searched: a table may keep its largest rate, and its log contradicts clipped readings.
     """
     notes: list[Note] = []
     if set(TABLE_CHANNELS) & table.values.keys():
@@ -186,8 +185,7 @@ def flag_flat_tops(table: Log, sensor: str, flags: NDArray[np.uint16]) -> list[N
 def find_stuck(table: Log, sensor: str, flags: NDArray[np.uint16]) -> dict[str, Index]:
     """Return the rows, by channel, of readings that are constant for longer than the noise of the channel allows.
 
-    Raises ``IngestError`` for an axis that is constant in half of the rows or more, while the other axes of its sensor
-    change.
+    ``IngestError``: an axis is constant in half of the rows or more, while the other axes of its sensor change.
     """
     neighbours = {c: v[1:] == v[:-1] for c in TRIADS[sensor] if (v := table.values.get(c)) is not None}
     found = {}
@@ -291,10 +289,7 @@ def _in_a_row(same: Mask, count: int) -> bool:
 
 
 def examine(table: Log, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[np.uint16] | None, list[Note]]:
-    """Return quality flags (None if none is set) and notes; raise ``IngestError`` for impossible values.
-
-    ``sensor``: with the full scales; None if they are not known.
-    """
+    """Return quality flags (None if none is set) and notes; raise ``IngestError`` for impossible values."""
     for channels in (*TRIADS.values(), ATTITUDE):
         missing = [c for c in channels if c not in table.values]
         if 0 < len(missing) < len(channels):

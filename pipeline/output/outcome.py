@@ -150,8 +150,7 @@ def commands_of(
     """Return the commands that add the effects which a diagnosis selected; ``{}`` if it selected none.
 
     ``add`` is for every run, ``once`` for one run. ``verb`` is "add", or "try" if the effects do not explain the whole
-    residual. ``part``: the sensor's part of ``diagnoses/<unit>.json``; ``settings``: of the run; ``results``: folder of
-    the results of all campaigns.
+    residual. ``part``: the sensor's part of ``diagnoses/<unit>.json``; ``results``: folder of all campaigns' results.
     """
     if not part.get("override"):
         return {}
@@ -204,8 +203,7 @@ def ratio_words(problem: Problem) -> str:
 def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) -> str:
     """Return the closing lines of a run, except those about failed units.
 
-    ``results``: folder of the campaign's results; ``settings``: of the run; ``of_this_run``: whether this run wrote the
-    last entry of the history.
+    ``of_this_run``: whether this run wrote the last entry of the history of the ``results``.
     """
     rows, folder = read_summary(results), str(results.parent)
     lines = _reasons(results, [row["unit"] for row in rows])
@@ -311,10 +309,7 @@ def changes_of(results: Path, units: Sequence[str]) -> list[str]:
 
 
 def uncertainty_words(before: JSON, after: JSON, unit: str) -> str:
-    """Return the change of the expanded uncertainties of bias and matrix in words; empty without a change.
-
-    ``before``, ``after``: states of a sensor in the history.
-    """
+    """Return in words how U of bias and matrix changed between two states of a sensor; empty without a change."""
     was, now = (state.get("uncertainty") or {} for state in (before, after))
     changes = [
         f"{key} {was[key] * scale:.2g} -> {now[key] * scale:.2g} {of}"
@@ -325,10 +320,7 @@ def uncertainty_words(before: JSON, after: JSON, unit: str) -> str:
 
 
 def run_command(settings: Mapping[str, Any]) -> str:
-    """Return the command of a run: ``snakemake`` where its rules are, else ``run`` of this package.
-
-    ``settings``: those of ``--config``: ``campaign``, ``overrides``, ``unit_overrides``, ``results`` ...
-    """
+    """Return the command of a run with settings of ``--config``: ``snakemake`` where its rules are, else ``run``."""
     if not Path("Snakefile").is_file():
         return _command("run", settings, [], str(settings.get("results") or DEFAULT_RESULTS))
     return shlex.join(["snakemake", "--cores", "2", *_config(settings)])

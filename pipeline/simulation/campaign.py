@@ -159,8 +159,8 @@ def record(
 ) -> list[Recording]:
     """Simulate the recordings of a unit with its sampling interval and share of lost samples.
 
-    ``benches``: role to bench, ``""`` for all other roles; ``effects``: sensor to its effects, of which effects of
-    mounting, table and timing change the motion; ``pause``: s, between the recordings and before the first.
+    ``benches``: by role, ``""`` for all others; ``effects``: by sensor, those of mounting, table and timing change the
+    motion; ``pause``: s, between the recordings and before the first.
     """
     times = _times(planned, unit.interval_s, pause)
     seconds = [t / SECOND_NS for t in times]
@@ -342,10 +342,7 @@ def columns_of(unit: UnitDescription) -> dict[str, str]:
 
 
 def programs_of(units: Sequence[UnitDescription]) -> dict[str, str]:
-    """Return the procedures of tables without a log, each with its program: name to YAML.
-
-    Raises ``ConfigurationError`` if units of one procedure have different programs.
-    """
+    """Return the procedures of tables without a log, name to YAML; refuse units of one with different programs."""
     found: dict[str, str] = {}
     for unit in units:
         if unit.log.kind == BY_PROGRAM:
@@ -374,8 +371,7 @@ def write_campaign(
 ) -> None:
     """Simulate every unit of a description and write the campaign; files of the same names are replaced.
 
-    ``progress`` is called with a line for each finished unit. ``sheet_only``: write ``units.csv`` without recordings
-    and truth, for a campaign whose run simulates them.
+    ``progress`` gets a line for each unit. ``sheet_only``: no recordings and truth, which the campaign's run makes.
     """
     for name, text in programs_of(description.units).items():
         path = directory / "configs" / "procedure" / f"{name}.yaml"
@@ -425,10 +421,9 @@ def _sheet_rows(description: Description) -> list[dict[str, Any]]:
 def simulate_unit(
     unit: UnitDescription, seed: int, number: int, extra: Sequence[Planned] = ()
 ) -> tuple[list[Recording], dict[str, Any]]:
-    """Return the recordings of one unit and its true parameters.
+    """Return the recordings of one unit, those of ``extra`` after those of its procedure, and its true parameters.
 
-    The seed and the unit's number in its campaign determine every random number. ``extra``: recordings to make after
-    those of the procedure.
+    The seed and the unit's number in its campaign determine every random number.
     """
     streams, course = Streams(seed, number), course_of(unit)
     benches, effects = _drawn(unit, streams)

@@ -142,8 +142,7 @@ class Course(Described):
 def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy: float = 0.0) -> list[Planned]:
     """Return the recordings of a procedure, in the order in which they are made.
 
-    Without a table, attitudes are set with the standard deviation ``hand_accuracy``, deg. Raises ``ConfigurationError``
-    if there is no such procedure.
+    ``hand_accuracy``: of attitudes without a table, standard deviation, deg. ``ConfigurationError``: no such procedure.
     """
     if procedure in TABLE_PROCEDURES:
         planned = _turns(course)
@@ -419,10 +418,7 @@ class Description(Described):
 
 
 def read_description(path: Path) -> Description:
-    """Read a ``simulation.yaml``.
-
-    Raises ``MissingInputError`` if there is none, ``ConfigurationError`` if a key is unknown.
-    """
+    """Read a ``simulation.yaml``; ``MissingInputError``: there is none; ``ConfigurationError``: it is wrong."""
     return description_from(_read_mapping(path), str(path))
 
 
@@ -497,10 +493,7 @@ def _units_of_entry(entry: UnitDescription) -> list[UnitDescription]:
 
 
 def add_recording_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for the bench and the procedure to a parser with ``argument_default=argparse.SUPPRESS``.
-
-    ``simulate`` and ``plan`` share them: a planned procedure can be simulated with the same options.
-    """
+    """Add the options for bench and procedure of ``simulate`` and ``plan`` to a parser whose default is SUPPRESS."""
     add = parser.add_argument
     add("--sensor", metavar="NAME", help="configs/sensor (mpu6050)")
     add("--table", metavar="NAME", help="configs/table (acutronic; hand for procedures without a table)")

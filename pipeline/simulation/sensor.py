@@ -233,10 +233,7 @@ def drawn_sensors(
     effects: Mapping[str, Hidden],
     rng: np.random.Generator,
 ) -> dict[str, SimulatedSensor]:
-    """Return accelerometer and gyroscope of a unit, from the configuration and the description of each.
-
-    Raises ``ConfigurationError`` if a key of the description is unknown.
-    """
+    """Return both sensors of a unit by configuration and description; ``ConfigurationError``: an unknown key."""
     mounting = rng.uniform(-1.0, 1.0, 3)
     out = {}
     for sensor in SENSORS:

@@ -273,8 +273,7 @@ class Gimbals:
 class Eased(Gimbals):
     """Motion of a table that begins and ends at rest: the motion of ``Gimbals`` at the time s(t).
 
-    At the start, ``s(t) = T u^4 (5/2 - 3 u + u^2)``, ``u = t / T``, with ``T = COMES_UP_S``; at the end, the same
-    backwards.
+    At the start, ``s(t) = T u^4 (5/2 - 3 u + u^2)``, ``u = t / T``, with ``T = COMES_UP_S``; at the end likewise.
     """
 
     def angles(self, time: Values) -> tuple[Values, ...]:
@@ -323,8 +322,7 @@ def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator) 
     """Draw a random motion whose |angular rate| has the maximum ``peak_rate`` (deg/s).
 
     The inner gimbal turns steadily and the middle one swings by 42 deg rms. Then the mean squares of the three
-    components of the vertical are equal: the attitudes cover the sphere evenly. The speed is scaled to the maximum
-    rate.
+    components of the vertical are equal: the attitudes cover the sphere evenly.
     """
     frequency = np.exp(rng.uniform(0.0, np.log(3.0), (3, SINUSOIDS))) / PERIOD_S
     weight = rng.uniform(0.5, 1.0, (3, SINUSOIDS))

@@ -201,10 +201,7 @@ class ExportedUnit:
 def exports(
     calibration: JSON, settings: Settings, validation: JSON | None = None, diagnosis: JSON | None = None
 ) -> dict[str, str]:
-    """Return the texts of a calibration in every format, by file name.
-
-    ``calibration, validation, diagnosis``: the published documents of the unit.
-    """
+    """Return the texts of a unit's published documents in every format, by file name."""
     sheets = {s: SensorFigures.of(settings.sensor.of(s)) for s in SENSORS}
     exported = ExportedUnit(calibration, sheets, settings.table.gravity_g, validation, diagnosis)
     return {file: text for format_name in formats() for file, text in export(format_name, exported).items()}

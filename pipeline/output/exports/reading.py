@@ -345,8 +345,7 @@ def convert(
 ) -> tuple[list[Path], list[str]]:
     """Write a calibration in a format; return the files and the losses, in sentences.
 
-    ``target``: the file; if the format has a file for each sensor, their endings are added to its stem.
-    ``sheets``: figures of each sensor, for counts and noise.
+    ``target``: its stem gets the endings of a format with a file for each sensor. ``sheets``: for counts and noise.
     """
     document = document_of(imported)
     if format_name == CALIBRATION:

@@ -60,12 +60,11 @@ def render(
 ) -> str:
     """Return ``index.html``.
 
-    ``rows``: of ``summary_row``, one a unit, in the order of ``units.csv``; ``failures``: ``unit, stage, code,
-    message, file`` of each failed unit; ``comparisons``: of ``comparison.section``; ``page``: name of a further page;
-    ``twins``: of ``gather.same_files``; ``statistics``: of ``fleet_statistics``; ``parameters``: of
-    ``parameter_table`` for all units; ``history``: of ``runs_data``; ``settings``: of the run, for the proposed
-    commands; ``published``: units with a page where pages are published on request only, None: all; ``about``: the
-    number of the last run that changed something, its day, and the version of this package.
+    ``rows``: of ``summary_row``, in the order of ``units.csv``; ``failures``: ``unit, stage, code, message, file`` of
+    each; ``comparisons``: of ``comparison.section``; ``page``: name of a further page; ``twins``: of
+    ``gather.same_files``; ``statistics``: of ``fleet_statistics``; ``parameters``: of ``parameter_table``; ``history``:
+    of ``runs_data``; ``settings``: of the run, for the proposed commands; ``published``: units with a page, None: all;
+    ``about``: ``run`` that last changed something, its ``day``, and the ``version`` of this package.
     """
     settings, states = settings or {"campaign": campaign}, [*map(state_of, rows)]
     found = problems(states)
@@ -323,10 +322,7 @@ def _quantiles(order: np.ndarray, values: np.ndarray, colour: int) -> list[Chart
 
 
 def strips(rows: Sequence[JSON], parameters: pd.DataFrame) -> list[UnitChart]:
-    """Return the strip plots of a campaign, each with the text of its dots.
-
-    ``rows``: of ``summary_row``, one a unit, in the order of the page; ``parameters``: of ``parameter_table``.
-    """
+    """Return the strip plots of a campaign, each with the text of its dots; ``rows``: in the order of the page."""
     siblings: dict[tuple[str, str], list[int]] = {}
     for i, row in enumerate(rows):
         if row["status"] == "ok":

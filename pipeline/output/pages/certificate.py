@@ -83,11 +83,7 @@ def certificate(
     temperature: str | None,
     diagnosis: JSON | None = None,
 ) -> JSON:
-    """Return the report of one calibrated unit.
-
-    ``settings``: of the unit; ``temperature``:
-    range of the sensor's temperature, degC, None where it was not recorded; ``diagnosis``: of the unit.
-    """
+    """Return the report of a calibrated unit; ``temperature``: range in degC, None where it was not recorded."""
     stated = settings.certificate
     document: JSON = {
         "schema": "imu-calibration/certificate/1",

@@ -295,10 +295,9 @@ def chart(
 ) -> Figure:
     """Return a figure with its chart: panels that share the axis x.
 
-    ``description``: for screen readers; ``x_label``: of the axis x; ``kind``: of the axis x, "", "angle" (deg),
-    "count" or "log"; ``margin``: share of the values' range by which the axis x exceeds it; ``left``: space for the
-    ticks of the axes y, px; ``columns``: names of x = 1, 2, ...; ``units``: list in the script of the page that names
-    the units.
+    ``description``: for screen readers; ``kind``: of the axis x, "", "angle" (deg), "count" or "log"; ``margin``: share
+    of the values' range by which the axis x exceeds it; ``left``: space for the ticks of the axes y, px; ``columns``:
+    names of x = 1, 2, ...; ``units``: list in the script of the page that names the units.
     """
     values = {id(layer.x): layer.x for p in panels for layer in p.layers if layer.x is not None}
     x = Axis.over(values.values(), left, CHART_WIDTH - RIGHT, kind, margin)

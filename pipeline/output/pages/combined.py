@@ -169,8 +169,7 @@ def with_values(calibration: SensorCalibration, theta: Values, lines: Sequence[C
 def repeatability(x: Values, variance: Values, kind: Index) -> Values:
     """Return r, the standard deviation in addition to the stated variances, of (n, p) values: (p,) array.
 
-    ``variance``: (n, p). ``kind``: (p,), 0 ..; parameters of one kind have one r. The sum decreases with r, which
-    is found by bisection.
+    ``variance``: (n, p). ``kind``: (p,), 0 ..; parameters of one kind have one r. The sum decreases with r: bisection.
     """
     n = len(x)
 
@@ -237,10 +236,7 @@ class UnitPrior(NamedTuple):
 
 
 def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> list[UnitEstimate]:
-    """Return the estimate of each sensor of a calibrated unit for the prior of its lot.
-
-    ``row``: of ``units.csv``; ``calibration``, ``diagnosis``: as published.
-    """
+    """Return the estimate of each sensor of a calibrated unit for the prior of its lot; ``row``: of ``units.csv``."""
     found, lot = [], row.get("lot")
     for sensor in [s for s in SENSORS if calibration[s]]:
         part = calibration[sensor]
@@ -274,8 +270,7 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
 def _divided(fit: SensorCalibration) -> tuple[Values, Values, tuple[Values, Values]]:
     """Return the covariance by the noise of the unit, the one by errors that siblings may share, and both freedoms.
 
-    The degrees of freedom of the readings follow from the effective ones by Welch and Satterthwaite, because the bench
-    has infinitely many.
+    That of the readings follows from the effective one by Welch and Satterthwaite: the bench has infinitely many.
     """
     readings, _ = own_and_bench(fit)
     own, shared = own_and_bench(fit, with_lack_of_fit=True)

@@ -170,10 +170,7 @@ def _exact(found: JSON) -> bool:
 def held_out_figures(
     sensor: str, fits: Mapping[str, SensorCalibration], held_out: JSON, recordings: list[Recording], table: Table
 ) -> list[Figure]:
-    """Draw the error of the magnitude in each held-out recording with a reference, as in the validation.
-
-    ``fits``: of the calibrated sensors; ``held_out``: the sensor's part of the validation.
-    """
+    """Draw the error of the magnitude in each held-out recording with a reference, as in the validation."""
     floor, by_hand, figures = held_out.get("noise_floor"), table.motion == "none", []
     for recording in (r for r in recordings if r.role == "validation"):
         logged = sensor == "accelerometer" or (recording.table_rate is not None and table.latitude_deg is None)
@@ -238,10 +235,7 @@ def _attitude_panel(curve: JSON, name: str, label: str) -> Panel:
 
 
 def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON | None) -> Figure | None:
-    """Draw the Allan deviation of each axis; None where no noise was identified.
-
-    ``noise``: the sensor's part of ``noise`` in its calibration; ``wander``: the bias wander by the diagnosis.
-    """
+    """Draw the Allan deviation of each axis; None where no noise was identified; ``wander``: by the diagnosis."""
     axes = {a: part for a, part in ((noise or {}).get("axes") or {}).items() if part["terms"]}
     if not noise or not axes:
         return None
@@ -268,10 +262,7 @@ def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON |
 
 
 def term_rows(noise: JSON | None) -> list[JSON]:
-    """Return a row for each term: its name, unit, and a text with interval or upper limit for each axis.
-
-    An axis whose noise was not identified has the text of an unknown number.
-    """
+    """Return a row for each term: its name, unit, and a text with interval or upper limit for each axis."""
     axes = [part["terms"] for part in ((noise or {}).get("axes") or {}).values()]
     if not any(axes):
         return []

@@ -183,10 +183,7 @@ def parameter_rows(sensor: str, part: JSON, data_sheet: DataSheet) -> list[JSON]
 def summary_row(
     unit: str, calibration: JSON, validation: JSON | None, diagnosis: JSON | None, units_table_row: dict[str, str]
 ) -> JSON:
-    """Return a unit's row: a dict from column to value, or None.
-
-    ``calibration, validation, diagnosis``: as in their files; ``units_table_row``: the unit's row of ``units.csv``.
-    """
+    """Return a unit's row: a dict from column to value, or None; ``units_table_row``: its row of ``units.csv``."""
     error = calibration.get("error") or {}
     file = f"{error['file']}: " if error.get("file") else ""
     row: JSON = dict.fromkeys(SUMMARY_COLUMNS) | {
@@ -234,10 +231,7 @@ def sheet_columns(row: JSON) -> dict[str, str]:
 
 
 def unit_parameters(calibration: JSON, sensor_model: Sensor) -> list[tuple[Any, ...]]:
-    """Return a row with the columns ``PARAMETER_KEYS`` for each parameter of a unit; none for a failed unit.
-
-    These are the fitted parameters, and the elements of P that a sensor file limits.
-    """
+    """Return a row of ``PARAMETER_KEYS`` for each fitted parameter and each limited element of P; none if it failed."""
     rows = []
     for sensor in [s for s in SENSORS if calibration.get(s)]:
         fitted = fitted_parameters(calibration[sensor])

@@ -161,10 +161,7 @@ class _BinnedMean:
     error: Values
 
     def excess(self, wander: Values) -> float:
-        """Return the mean square of the means over the variance of noise and wander, of the worst axis.
-
-        ``wander``: standard deviations by axis.
-        """
+        """Return the mean square of the means over the variance of noise and wander, of the worst axis."""
         filled = np.isfinite(self.mean[:, 0])
         ratio = self.mean[filled] ** 2 / (self.error[filled] ** 2 + wander**2)
         return float(ratio.mean(axis=0).max())
@@ -201,10 +198,7 @@ def _binned_mean(covariate: Values, error: Values, finite: Mask, mean_square: Va
 
 
 def covariates(found: list[Residual], wander: Values) -> dict[str, _BinnedMean]:
-    """Return binned means over all recordings by covariate, the largest excess first.
-
-    Of the components of the specific force only the one with the largest excess is returned.
-    """
+    """Return binned means over all recordings by covariate, the largest excess first; of one force component only."""
     out: dict[str, _BinnedMean] = {}
     errors: dict[tuple[int, ...], tuple[Values, Mask, Values]] = {}  # by the recordings that have a covariate
     for label, value in COVARIATES.items():
@@ -308,10 +302,7 @@ def _harmonics(sensor: str, name: str, amplitudes: Values, level: Values) -> Fig
 
 
 def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -> Figure:
-    """Draw readings and model over a turn, and below them the residual of each axis with the band of +-2 sigma.
-
-    Without a noise model, sigma follows from the scatter of the residual.
-    """
+    """Draw readings and model over a turn, and below them the residual of each axis with the band of +-2 sigma."""
     unit, motion, name = SENSOR_UNITS[sensor], residual.motion, residual.recording.name
     turns = motion.angle is not None and np.ptp(motion.angle) > 1.0
     x = motion.angle if turns and motion.angle is not None else motion.time

@@ -77,9 +77,8 @@ def render(
 ) -> str:
     """Return the page of one unit as HTML.
 
-    ``calibration, validation, diagnosis``: as in their files, the last two None where their stage failed;
-    ``recordings``: after the filter, may be empty; ``settings``: the unit's resolved configuration; ``words``: the
-    diagnosis of each sensor in sentences; ``incomplete``: ``stage`` and ``message`` of what could not be made.
+    ``validation, diagnosis``: None where their stage failed; ``recordings``: after the filter, may be empty; ``words``:
+    the diagnosis of each sensor in sentences; ``incomplete``: ``stage`` and ``message`` of what could not be made.
     """
     row = summary_row(str(calibration.get("unit")), calibration, validation, diagnosis, {})
     validation, diagnosis, words = validation or {}, diagnosis or {}, words or {}
@@ -200,8 +199,7 @@ def _sensor(
 def use_rows(part: JSON, noise: JSON | None) -> list[JSON]:
     """Return what a user of the calibration needs by axis: bias and matrix with U, and the noise terms N, B and K.
 
-    A row has ``name``, ``key`` of its definition, ``texts`` of x, y, z and U, and ``unit`` with an SI prefix. ``part``,
-    ``noise``: the sensor's parts of a calibration, and of its ``noise``.
+    A row has ``name``, ``key`` of its definition, ``texts`` of x, y, z and U, and ``unit`` with an SI prefix.
     """
     bias, matrix = fitted_parameters(part)[BIAS], fitted_parameters(part)[MATRIX]
     rows: list[JSON] = []
@@ -243,10 +241,7 @@ def files_read(inputs: list[JSON] | None) -> list[JSON]:
 
 
 def rest_rows(part: JSON) -> list[JSON]:
-    """Return the rests that were found in the readings, in order of time: used, held out or left out, and why.
-
-    ``part`` contains them in ``rests``, or in the ``details`` of the stages of a fit.
-    """
+    """Return the rests that were found in the readings, in order of time: used, held out or left out, and why."""
     found = [part.get("rests") or {}, *(stage.get("details") or {} for stage in part.get("stages") or [])]
     keys = {use: f"rests_{use.replace(' ', '_')}" for use in USES}
     rows = [{**r, "use": use} for rests in found for use, key in keys.items() for r in rests.get(key) or []]
