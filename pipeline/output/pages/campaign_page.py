@@ -19,7 +19,7 @@ from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Values
 from pipeline.core.verdicts import FAR, KINDS, MARK_ABOVE_FLOORS, RowState, Verdict, far_by_moves, problems, state_of
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.outcome import all_well, beyond_limits_groups, command_of, counts_of, explain_command, ratio_words
-from pipeline.output.pages.chart import Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
+from pipeline.output.pages.chart import Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, worded
 from pipeline.output.pages.fleet import parameter_table, wide
 from pipeline.output.pages.pages import Scale, number, percent, scale_of, script_data, template, typeset, unit_text
 from pipeline.output.pages.parameters import SUMMARY_COLUMNS
@@ -369,8 +369,10 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
                 for a, b in zip(i, j, strict=True)
             ]
     worst, column = np.unravel_index(np.nanargmax(np.abs(share)), share.shape)
-    finding, caption, description = sentences(
+    texts = worded(
         "strip",
+        name,
+        tuple(legend),
         title=title,
         beyond=int(beyond.any(axis=1).sum()),
         count=len(numbers),
@@ -380,11 +382,10 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
         edge=MAX_DRAWN_SHARE if np.nanmax(np.abs(share)) > MAX_DRAWN_SHARE else 0,
         medians=[*zip(labels, np.nanmedian(share, axis=0).tolist(), strict=True)],
     )
-    figure = Figure(name, finding, caption, tuple(legend))
     panel = Panel([*layers, *dots], "", ROW * len(labels), limits=(0.4, height[0] + 0.6), rows=labels[::-1])
     label = "share of the data sheet's limit, %"
     left = max(LEFT, round(NAME_LETTER * max(map(len, labels))) + 10)
-    return chart(figure, description, [panel], label, margin=0.03, left=left, units="units"), values
+    return chart(*texts, [panel], label, margin=0.03, left=left, units="units"), values
 
 
 def _bar(ends: Values, low: float, high: float, colour: int) -> ChartLayer:

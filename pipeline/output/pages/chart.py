@@ -35,6 +35,7 @@ ANGLE_STEPS = (10.0, 15.0, 30.0, 45.0, 90.0, 180.0, 360.0, 720.0, 1800.0, 3600.0
 LINEAR_TO = 10.0  # value to which a symlog axis is linear: delta BIC of strong evidence
 
 Tick = tuple[float, str]
+Legend = tuple[tuple[str, str], ...]
 Places = dict[tuple[int, int], tuple[Values, Integers]]  # of ``_placed``
 AXES_LEGEND = (("c0", "x"), ("c1", "y"), ("c2", "z"))
 CHART_WIDTH = 420  # px, of the drawing; the page scales it
@@ -194,7 +195,7 @@ class Figure(NamedTuple):
     name: str
     finding: str
     caption: str = ""
-    legend: tuple[tuple[str, str], ...] = ()
+    legend: Legend = ()
     quiet: bool = False
     svg: str = ""
 
@@ -209,12 +210,12 @@ class Figure(NamedTuple):
         return self._replace(svg=svg, finding=finding, caption=typeset(self.caption))
 
 
-def sentences(figure: str, **values: Any) -> tuple[str, str, str]:  # noqa: ANN401
-    """Return the sentences of a chart by its macro in ``templates/figures.txt``: finding, caption, description."""
-    text = str(getattr(template("figures.txt").module, figure)(**values))
+def worded(macro: str, name: str, legend: Legend = (), /, **values: Any) -> tuple[Figure, str]:  # noqa: ANN401
+    """Return a figure with the texts of a macro in ``templates/figures.txt``, and its description."""
+    text = str(getattr(template("figures.txt").module, macro)(**values))
     parts = (part.replace("\n", " ").split(" ") for part in text.split("---\n"))
     finding, caption, *description = (" ".join(filter(None, words)).strip() for words in parts)
-    return finding, caption, " ".join(description)
+    return Figure(name, finding, caption, legend), " ".join(description)
 
 
 class LineMark(NamedTuple):

@@ -58,7 +58,7 @@ from pipeline.output.pages.chart import (
     Panel,
     SampleMarks,
     chart,
-    sentences,
+    worded,
 )
 from pipeline.output.pages.group_charts import Point, bars, stems
 from pipeline.output.pages.pages import measured, number, percent, unit_text
@@ -322,8 +322,8 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
     ratio, by_encoder = float((rms / sigma).max()), float(residual.reference_noise.max())
     by_reference = (AXES[int(np.argmax(residual.reference_noise))], by_encoder) if known and by_encoder else None
     about = {"name": name, "ratio": ratio, "outside": outside, "reference": by_reference, "known": known}
-    finding, caption, description = sentences("model", **about, rms=rms.tolist(), unit=unit, noise=NOISE_ALONE_RATIO)
-    figure = Figure(f"{sensor}-{name}", finding, caption, (*AXES_LEGEND, ("c5", "model")))
+    about |= {"rms": rms.tolist(), "unit": unit, "noise": NOISE_ALONE_RATIO}
+    figure, description = worded("model", f"{sensor}-{name}", (*AXES_LEGEND, ("c5", "model")), **about)
     label, kind = ("angle of the rate table, deg", "angle") if turns else ("time, s", "")
     return chart(figure, description, panels, label, kind=kind)
 
@@ -360,9 +360,8 @@ def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
         return None
     excluded, prior = sum(row["excluded"] for row in shown), prior_limit()
     counts = {"count": len(shown), "excluded": excluded, "others": len(shown) - MOST_LIMITS}
-    finding, caption, _ = sentences("limits", **counts, below=EXCLUDED * prior, prior=prior)
+    figure, _ = worded("limits", f"{sensor}-limits", **counts, below=EXCLUDED * prior, prior=prior)
     points = [Point(row["label"], row["share"], 3) for row in shown[:MOST_LIMITS]]
-    figure = Figure(f"{sensor}-limits", finding, caption)
     label = "upper limit over the data sheet's limit (logarithmic)"
     return bars(figure, points, label, levels={"limit of the sensor file": 1.0})
 
@@ -386,8 +385,9 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
     brackets = _brackets(shown, selected)
     best = max((r for r in entries if r["effect"] not in selected), key=_evidence, default=None)
     value = _evidence(next((r for r in entries if r["effect"] == (selected or [None])[0]), {}))
-    finding, caption, _ = sentences(
+    figure, _ = worded(
         "ranking",
+        f"{sensor}-ranking",
         selected=selected,
         value=value,
         best=best,
@@ -398,7 +398,6 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
         others=len(entries) - len(shown),
         hidden=shortened([plain(h["effect"]) for h in hidden], MOST_HIDDEN),
     )
-    figure = Figure(f"{sensor}-ranking", finding, caption)
     label = "ΔBIC (linear to ±10, logarithmic beyond)"
     levels = {f"threshold {MIN_DELTA_BIC:g}": MIN_DELTA_BIC}
     return bars(figure, rows, label, levels=levels, kind="symlog", brackets=brackets)
@@ -458,8 +457,8 @@ def added_variable(sensor: str, found: JSON) -> Figure | None:
     slopes = "; ".join(dict.fromkeys(_coefficient(p) for p in shown["panels"]))
     x_unit = _column_unit(best["unit"], unit)
     shown = {"coefficient": _coefficient(best), "slopes": slopes, "straight": straight, "scatter": scatter}
-    finding, caption, description = sentences("added_variable", effect=effect, **shown)
-    figure = Figure(f"{sensor}-added-variable", finding, caption, (("c5", "slope = parameter"),))
+    legend = (("c5", "slope = parameter"),)
+    figure, description = worded("added_variable", f"{sensor}-added-variable", legend, effect=effect, **shown)
     label = f"column of {what}, minus all other columns" + (f", {x_unit}" if x_unit else "")
     return chart(figure, description, panels, label)
 
@@ -511,11 +510,9 @@ def unexplained(sensor: str, found: JSON) -> list[Figure]:
             panels.append(Panel(layers, f"{panel['axis']}, {unit}", 76, {"": 0.0}))
         reaches = [f"{p['axis']} up to {number(float(np.abs(p['mean']).max()))} {unit}" for p in shown["panels"]]
         about = {"covariate": covariate, "entry": entries.get(covariate, {}), "reaches": reaches}
-        about |= {"fitted": bool(scatter)}
-        follow = all(mean_square < ON_THE_LINE for mean_square in scatter)
-        finding, caption, description = sentences("unexplained", **about, follow=follow)
+        about |= {"fitted": bool(scatter), "follow": all(mean_square < ON_THE_LINE for mean_square in scatter)}
         legend = (("c5", "suggested shape"),) if scatter else ()
-        figure = Figure(f"{sensor}-unexplained-{covariate}", finding, caption, legend)
+        figure, description = worded("unexplained", f"{sensor}-unexplained-{covariate}", legend, **about)
         label = SIGNAL_NAMES.get(shown["signal"], f"what the axis should read, {SENSOR_UNITS[sensor]}")
         kind = "angle" if shown["signal"] == "angle" else ""
         figures.append(chart(figure, description, panels, label, kind=kind))
