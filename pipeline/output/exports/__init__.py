@@ -70,7 +70,7 @@ class Format:
     consumer: str  # program that reads the file
     equation: str  # by which the consumer corrects a reading
     source: str  # documentation of the equation
-    file: str  # name of the file, with {unit} for the name of the unit; default: name of the template
+    file: str = ""  # name of the file, with {unit} for the name of the unit; default: name of the template
     units: dict[str, Literal["g", "m/s^2", "deg/s", "rad/s"]]  # of readings; the format has only sensors with a unit
     sensor_endings: dict[str, str] = field(default_factory=dict)  # of file names, if each sensor has a separate file
     required: list[str] = field(default_factory=list)  # sensors that must be calibrated; "board": the reference chip
@@ -105,10 +105,7 @@ def _environment() -> Templates:
 
 def text_of(name: str, **values: Any) -> str:  # noqa: ANN401
     """Render a template that is not a format."""
-    return _template(name).render(values)
-
-
-_template = cache(lambda name: _environment().get_template(name))
+    return _environment().get_template(name).render(values)
 
 
 @cache
@@ -117,9 +114,9 @@ def formats() -> dict[str, tuple[Format, Template]]:
 
     Raises ``ConfigurationError`` for a missing or unknown key of a declaration, an unknown unit, or one file of two.
     """
-    keys = [key for key in dataclass_fields(Format) if key.name != "file"]
+    keys = dataclass_fields(Format)
     required = [key.name for key in keys if key.default is MISSING and key.default_factory is MISSING]
-    checks: dict[str, Check] = {key.name: lambda value: value for key in dataclass_fields(Format)}
+    checks: dict[str, Check] = {key.name: lambda value: value for key in keys}
     check = fields(checks | {"units": each(one_of(*UNIT_FACTORS))}, required)
     formats_by_name: dict[str, tuple[Format, Template]] = {}
     environment = _environment().overlay(loader=_Texts(TEMPLATES))

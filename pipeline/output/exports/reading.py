@@ -286,11 +286,10 @@ def _thermal(sensor: str, polynomial: Values, notes: list[str]) -> list[FittedEf
     polynomial = np.where(np.abs(polynomial) > FORMAT_ROUNDING * np.abs(polynomial).max(), polynomial, 0.0)
     if np.any(polynomial[:, 4:]):
         notes.append(f"{sensor}: the bias beyond the third order of the temperature is left out")
-    if np.any(polynomial[:, 3:4]):
-        return [fitted_effect("bias_temperature_cubic", sensor, polynomial[:, 1:4].ravel())]
-    if np.any(polynomial[:, 2:3]):
-        return [fitted_effect("bias_temperature_quadratic", sensor, polynomial[:, 1:3].ravel())]
-    return [fitted_effect("bias_temperature", sensor, polynomial[:, 1])] if np.any(polynomial[:, 1:2]) else []
+    for order, name in ((3, "bias_temperature_cubic"), (2, "bias_temperature_quadratic"), (1, "bias_temperature")):
+        if np.any(polynomial[:, order : order + 1]):
+            return [fitted_effect(name, sensor, polynomial[:, 1 : order + 1].ravel())]
+    return []
 
 
 def document_of(imported: ImportedCalibration) -> JSON:
