@@ -34,11 +34,9 @@ components.
     A(t) = P(tau),   r(t) = P'(tau),   tau = m_j + (1 + k) (t - t_j) + d_j       near move j
 
 with the commanded angle P, deg, at the program's time tau. The middle m_j of move j is at the sensor's time t_j by
-offset and drift of the whole program (``pipeline.ingest.clock_alignment``); d_j is the deviation of the move from that,
-s. The drift k during moves is separate, because pauses between moves would bias it.
-
-``d_j`` and ``k`` are fitted to the readings w = a P'(tau) + b of the gyroscope near the move, so that pauses between
-moves may have any length. Lost steps of the motors are not observable; they are part of the table's accuracy.
+offset and drift of the whole program, as above; d_j, s, is the deviation of the move from that. ``d_j`` and ``k`` are
+fitted to the readings w = a P'(tau) + b of the gyroscope near the move, so that pauses between moves may have any
+length. Lost steps of the motors are not observable; they are part of the table's accuracy.
 """
 
 from __future__ import annotations

@@ -3,17 +3,11 @@
 Every stream of random numbers has a separate generator, ``default_rng([seed, unit, stream])``, so that a change in one
 (say, lost samples) does not change the others.
 
-The table's log is in the sensor's rows, in a file with a separate clock, or only the commanded program is known.
+The table's log is in the sensor's rows, or in a file with the interval and the clock of the table's computer,
 
-    tau = t + d + k t
+    tau = t + d + k t,    t, tau : the sensor's and the table's clock, s,    d, k : offset and drift, s and 1
 
-where
-
-t, tau : the sensor's and the table's clock, s
-d, k   : offset and drift of the table's clock, s and 1
-
-A file has the sampling interval of the table's computer. For a table without encoders the program is written as a
-separate procedure.
+For a table without encoders its program is written instead, as a separate procedure.
 
     <directory>/units.csv, campaign.yaml, simulation.yaml
     <directory>/raw/<unit>/<recording>.csv (or .mcap)
