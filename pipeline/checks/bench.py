@@ -109,11 +109,9 @@ class TurnMounting:
 
 def stated_bench(entry: RecordingFile | None, table: Table, axis: str) -> TurnMounting:
     """Return the mounting that a recording's entry in the procedure states; the table states sense and zero else."""
-    if entry is None:
-        return TurnMounting(axis, usual_up(axis), table.sense, table.zero_deg)
-    sense = table.sense if entry.sense is None else entry.sense
-    zero_deg = table.zero_deg if entry.zero_deg is None else entry.zero_deg
-    return TurnMounting(axis, entry.up or usual_up(axis), sense, zero_deg)
+    sense = table.sense if entry is None or entry.sense is None else entry.sense
+    zero_deg = table.zero_deg if entry is None or entry.zero_deg is None else entry.zero_deg
+    return TurnMounting(axis, (entry and entry.up) or usual_up(axis), sense, zero_deg)
 
 
 def found_bench(fit: TurnFit, axis: str) -> TurnMounting | None:

@@ -217,8 +217,9 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
         for step in np.unique(steps[steps > 0.0]):
             off = np.sqrt(3.0) * rounding[steps == step].max()  # half-width of a rectangle
             axes = ", ".join(name for name, s in zip(TRIADS[sensor], steps, strict=True) if s == step)
-            whole = (d for d in range(MAX_SIGNIFICANT_DIGITS) if _is_whole(step * 10.0**d))
-            digits = next((f", {d} decimal{'s' * (d != 1)}," for d in whole), "")
+            shifted = step * 10.0 ** np.arange(MAX_SIGNIFICANT_DIGITS)
+            whole = np.flatnonzero(np.abs(shifted - np.rint(shifted)) < SAME_STEP * shifted).tolist()
+            digits = f", {whole[0]} decimal{'s' * (whole[0] != 1)}," if whole else ""
             detail = (
                 f"{axes}: steps of {step:.3g} {SENSOR_UNITS[sensor]}{digits} and noise of less than half a step: "
                 f"means are off by up to {off:.3g} {SENSOR_UNITS[sensor]}, however long the "
@@ -247,10 +248,6 @@ def _with_settling(recording: Recording) -> Recording:
     return recording.noted(Note("N-REFERENCE" if settling.clear else "N-SETTLING", recording.samples, 0, 0, detail))
 
 
-def _is_whole(value: float) -> bool:
-    return abs(value - round(value)) < SAME_STEP * abs(value)
-
-
 def _placed(recordings: list[Recording], table: Table) -> list[Recording]:
     """Note the gravity at the latitude if ``gravity_g`` is left at 1, and the azimuths of the turn axes."""
     latitude, azimuth = table.latitude_deg, table.azimuth_deg
@@ -276,7 +273,7 @@ def _placed(recordings: list[Recording], table: Table) -> list[Recording]:
 
 
 def _check_shared_rows(recordings: Sequence[Recording]) -> None:
-    recordings = [r for r in recordings if r.accelerometer is not None or r.gyroscope is not None]
+    recordings = [r for r in recordings if r.readings]
     decimals = [_decimals(r) for r in recordings]
     for coarser in sorted({tuple(map(min, x, y)) for x, y in itertools.combinations(decimals, 2)}, reverse=True):
         _check_at(recordings, coarser)

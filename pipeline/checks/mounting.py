@@ -268,7 +268,6 @@ def _departure(turn: TurnRecording, tolerance: float, lean: float) -> _Departure
 
 
 def _axis(turn: TurnRecording, tolerance: float, lean: float) -> _Departure | None:
-    """Return the difference of the turn axis."""
     axis, fit, name = turn.stated.axis, turn.fit, turn.name
     direction = fit.turn_axis if fit.turn_axis is not None else fit.gain
     if direction is None:
@@ -298,7 +297,6 @@ def _gyroscope_sense(turn: TurnRecording) -> _Departure | None:
 
 
 def _face(turn: TurnRecording, found: TurnMounting, tolerance: float) -> _Departure | None:
-    """Return the difference of sense, upward face or zero."""
     stated, allowed = turn.stated, turn.tolerance_deg
     off = (found.offset - stated.offset + 180.0) % 360.0 - 180.0
     if found.sense == stated.sense:

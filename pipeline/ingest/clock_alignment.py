@@ -427,7 +427,6 @@ def _notes(sensor: Log, rows: slice, fit: ClockFit, offset_s: float) -> list[Not
 
 
 def _one_digit(value: float) -> str:
-    """Return a number with one significant digit, without exponent."""
     return np.format_float_positional(float(f"{value:.1g}"), trim="-")
 
 

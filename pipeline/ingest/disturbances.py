@@ -74,8 +74,7 @@ def leave_out_disturbances(recording: Recording, note: Callable[[str, Index, str
 
     Of more than the share ``most``, a property of the bench, none is removed, and that is noted.
     """
-    silent = recording.accelerometer is None and recording.gyroscope is None
-    if silent or most == 0 or recording.samples < 4 * FEWEST_AROUND:
+    if not recording.readings or most == 0 or recording.samples < 4 * FEWEST_AROUND:
         return recording
     excess, where = disturbed(recording)
     excess[~recording.valid] = 0.0  # no fit looks at them
@@ -113,9 +112,9 @@ def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
 
     Samples next to an event of several samples are given the smallest positive excess, so that they are removed, too.
     """
-    found = [(s, r) for s in SENSOR_UNITS if (r := recording.reading(s)) is not None]
-    where = [(s, axis) for s, _ in found for axis in "xyz"]
-    raw = np.concatenate([r for _, r in found], axis=1)
+    found = recording.readings
+    where = [(s, axis) for s in found for axis in "xyz"]
+    raw = np.concatenate([*found.values()], axis=1)
     excess = np.zeros_like(raw)
     if not np.isfinite(raw).all():
         return excess, where
@@ -123,7 +122,7 @@ def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
     if not any((s > JUMP * _noise(s)).any() for s in step.T[:, :, None]):  # mostly the first column of a move
         return excess, where
     motion = _Motion(recording)
-    values = np.concatenate([motion.unexplained(s, r) for s, r in found], axis=1)
+    values = np.concatenate([motion.unexplained(s, r) for s, r in found.items()], axis=1)
     step = np.abs(values[1:] - values[:-1])
     noise = _noise(step)
     jump = step - JUMP * noise
@@ -161,7 +160,7 @@ def _scatter(values: Values) -> float:
 
 def _widened(excess: Values) -> Values:
     rows = np.flatnonzero(np.any(excess > 0, axis=1))
-    for event in [] if not rows.size else np.split(rows, np.flatnonzero(np.diff(rows) > SAME_EVENT) + 1):
+    for event in np.split(rows, np.flatnonzero(np.diff(rows) > SAME_EVENT) + 1):
         if len(event) > 2:
             inside = slice(max(event[0] - 2, 0), event[-1] + 3)
             excess[inside] = np.maximum(excess[inside], np.finfo(float).tiny)
@@ -266,7 +265,7 @@ def leave_out_shaken_rests(recording: Recording, note: Callable[[str, Index, str
     pieces = _pieces(recording)
     if len(pieces) < FEWEST_PIECES:
         return recording
-    found = {s: r for s in SENSOR_UNITS if (r := recording.reading(s)) is not None and np.isfinite(r).all()}
+    found = {s: r for s, r in recording.readings.items() if np.isfinite(r).all()}
     if not found:
         return recording
     excess, scatter = _excess(np.concatenate([*found.values()], axis=1), pieces[:, :2])

@@ -360,7 +360,6 @@ def once_command(settings: Mapping[str, Any], unit: str, override: str, results:
 
 
 def _command(command: str, settings: Mapping[str, Any], words: Sequence[str], results: str) -> str:
-    """Return a command of this package for the campaign of a run."""
     folder = ["--results", results] if results != DEFAULT_RESULTS else []
     rest = {key: value for key, value in settings.items() if key not in ("campaign", "results")}
     return shlex.join([*_program(), command, str(settings.get("campaign", "demo")), *words, *folder, *_config(rest)])

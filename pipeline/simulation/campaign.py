@@ -219,7 +219,6 @@ def _scene(plan: Planned, bench: SimulatedBench, start: float, rng: np.random.Ge
 
 
 def _log(plan: Planned, bench: SimulatedBench, time: Values) -> dict[str, Any]:
-    """Return the table's log of the commanded motion."""
     trajectory = plan.trajectory
     if bench.table.motion == "none":
         return {}

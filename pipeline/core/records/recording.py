@@ -185,6 +185,11 @@ class Recording:
         """Return the (n, 3) readings of ``accelerometer`` (g) or ``gyroscope`` (deg/s), or None."""
         return self.accelerometer if sensor == "accelerometer" else self.gyroscope
 
+    @property
+    def readings(self) -> dict[str, Values]:
+        """The (n, 3) readings of each sensor that the recording has, g and deg/s."""
+        return {sensor: values for sensor in TRIADS if (values := self.reading(sensor)) is not None}
+
     def noted(self, *notes: Note) -> Self:
         """Return the recording with further notes."""
         return replace(self, notes=(*self.notes, *notes))

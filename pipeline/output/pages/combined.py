@@ -51,6 +51,7 @@ from pipeline.core.records import (
     Values,
     files_of_readings,
     matrix_of,
+    with_arrays,
 )
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.engine import scaled_inverse
@@ -211,8 +212,7 @@ class UnitEstimate(NamedTuple):
     def read(cls, data: JSON) -> UnitEstimate:
         """Return the estimate of an entry of a file; equal texts of all units share their memory."""
         texts = {k: sys.intern(data[k]) for k in ("sensor", "lot", "comparable")}
-        arrays = {k: np.array(data[k]) for k in ("values", "own", "freedom", "shared", "kind", "known")}
-        return cls(**{**data, **texts, **arrays})
+        return cls(**{**with_arrays(data), **texts})
 
 
 class UnitPrior(NamedTuple):
