@@ -144,44 +144,41 @@ def lines_of(groups: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     return [f"{what}: {', '.join(shortened(units, NAMED_PER_LINE))}" for what, units in groups]
 
 
-def commands_of(
-    part: Mapping[str, Any], sensor: str, unit: str, settings: Mapping[str, Any], results: str = DEFAULT_RESULTS
-) -> JSON:
+def commands_of(part: Mapping[str, Any], sensor: str, unit: str, settings: Mapping[str, Any]) -> JSON:
     """Return the commands that add the effects which a diagnosis selected; ``{}`` if it selected none.
 
     ``add`` is for every run, ``once`` for one run. ``verb`` is "add", or "try" if the effects do not explain the whole
-    residual. ``part``: the sensor's part of ``diagnoses/<unit>.json``; ``results``: folder of all campaigns' results.
+    residual. ``part``: the sensor's part of ``diagnoses/<unit>.json``.
     """
     if not part.get("override"):
         return {}
     effects = [f"{sensor}.{name}" for name in part["selected"]]
     verb = "add" if part["verdict"] == Verdict.MISSING_EFFECT else "try"
-    them, once = "it" if len(effects) == 1 else "them", once_command(settings, unit, part["override"], results)
-    return {"verb": f"{verb} {them}", "add": add_command(settings, unit, effects, results), "once": once}
+    them, once = "it" if len(effects) == 1 else "them", once_command(settings, unit, part["override"])
+    return {"verb": f"{verb} {them}", "add": add_command(settings, unit, effects), "once": once}
 
 
-def command_of(problem: Problem, settings: Mapping[str, Any], results: str = DEFAULT_RESULTS) -> str:
+def command_of(problem: Problem, settings: Mapping[str, Any]) -> str:
     """Return the command with which the user can continue: it adds, runs again, or shows the evidence."""
     units, overrides = problem.units, SETTING.findall(problem.step)
     if problem.kind == Verdict.MISSING_EFFECT:
         if len(units) == 1:
-            return add_command(settings, units[0], problem.effects, results)
+            return add_command(settings, units[0], problem.effects)
         names = {effect.partition(".")[2] for effect in problem.effects}
-        return _command("add", settings, ["--missing", *(names if len(names) == 1 else ())], results)
-    again = dict(settings) | ({"results": results} if results != DEFAULT_RESULTS else {})
+        return _command("add", settings, ["--missing", *(names if len(names) == 1 else ())])
     if problem.kind == FAILED:
-        return run_command(again)
+        return run_command(settings)
     if overrides and len(units) <= NAMED_PER_LINE:
         given = settings.get("unit_overrides") or {}
         of_units = {unit: [*given.get(unit, []), *overrides] for unit in sorted(units)}
-        return run_command(again | {"unit_overrides": {**given, **of_units}})
-    return explain_command(settings, [units[0]], results)
+        return run_command({**settings, "unit_overrides": {**given, **of_units}})
+    return explain_command(settings, [units[0]])
 
 
-def explain_command(settings: Mapping[str, Any], words: Sequence[str], results: str = DEFAULT_RESULTS) -> str:
+def explain_command(settings: Mapping[str, Any], words: Sequence[str]) -> str:
     """Return the command that shows the evidence for some units, or with ``--all`` for every unit."""
     campaign = str(settings.get("campaign", "demo")).rstrip("/")
-    return _command("explain", {"campaign": campaign}, words, results)
+    return _command("explain", {"campaign": campaign, "results": settings.get("results")}, words)
 
 
 def problem_words(problem: Problem, most: int = NAMED_PER_LINE) -> str:
@@ -205,7 +202,7 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
 
     ``of_this_run``: whether this run wrote the last entry of the history of the ``results``.
     """
-    rows, folder = read_summary(results), str(results.parent)
+    rows, settings = read_summary(results), {**settings, "results": str(results.parent)}
     lines = _reasons(results, [row["unit"] for row in rows])
     lines += lines_of(beyond_limits_groups(rows))
     lines += lines_of(_not_in_uncertainty(rows).items())
@@ -217,30 +214,30 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
         lines += shortened(_changes(entries), NAMED_PER_LINE, "sensors that changed")
         no_longer = [
             f"{unit}: this run no longer has {', '.join(effects)}, which run {run} had; to have it in every run:\n"
-            f"  {add_command(settings, unit, effects, folder)}"
+            f"  {add_command(settings, unit, effects)}"
             for (unit, run), effects in dropped(entries).items()
         ]
         lines += shortened(no_longer, NAMED_PER_LINE, "units that no longer have an effect")
     found = problems(rows, once=True)
     for problem in reversed(found):  # the most urgent next to the end
         if problem.kind not in (FAILED, Verdict.MISSING_EFFECT):
-            lines += [problem_words(problem), f"  {command_of(problem, settings, folder)}"]
-    lines += [*_missing(found, settings, folder), *filter(None, [all_well(rows)])]
+            lines += [problem_words(problem), f"  {command_of(problem, settings)}"]
+    lines += [*_missing(found, settings), *filter(None, [all_well(rows)])]
     return "\n".join([*lines, f"{counted(rows)}; look at {results}/index.html"]) + "\n"
 
 
-def _missing(found: Sequence[Problem], settings: Mapping[str, Any], results: str) -> list[str]:
+def _missing(found: Sequence[Problem], settings: Mapping[str, Any]) -> list[str]:
     """Return the lines before the last: each unit with a missing effect, or how many there are and what lists them."""
     missing = [problem for problem in found if problem.kind == Verdict.MISSING_EFFECT]
     units = {unit for problem in missing for unit in problem.units}
     if len(units) > NAMED_MISSING:
         return [
-            f"effect missing: {len(units)} units; to list them:", f"  {explain_command(settings, ['--all'], results)}",
-            "to add to each unit its missing effects:", f"  {_command('add', settings, ['--missing'], results)}",
+            f"effect missing: {len(units)} units; to list them:", f"  {explain_command(settings, ['--all'])}",
+            "to add to each unit its missing effects:", f"  {_command('add', settings, ['--missing'])}",
         ]  # fmt: skip
     lines = [problem_words(problem, NAMED_MISSING) for problem in missing]
-    commands = [command_of(missing[0], settings, results)] if len(missing) == 1 else []
-    commands = commands or [_command("add", settings, ["--missing"], results)] * bool(missing)
+    commands = [command_of(missing[0], settings)] if len(missing) == 1 else []
+    commands = commands or [_command("add", settings, ["--missing"])] * bool(missing)
     return lines + [f"  {command}" for command in commands]
 
 
@@ -322,7 +319,7 @@ def uncertainty_words(before: JSON, after: JSON, unit: str) -> str:
 def run_command(settings: Mapping[str, Any]) -> str:
     """Return the command of a run with settings of ``--config``: ``snakemake`` where its rules are, else ``run``."""
     if not Path("Snakefile").is_file():
-        return _command("run", settings, [], str(settings.get("results") or DEFAULT_RESULTS))
+        return _command("run", settings, [])
     return shlex.join(["snakemake", "--cores", "2", *_config(settings)])
 
 
@@ -333,7 +330,7 @@ def apply_command(settings: Mapping[str, Any], unit: str) -> str:
     return shlex.join([*_program(), "apply", "--calibration", file, "LOG.csv", "-o", "LOG_calibrated.csv"])
 
 
-def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], results: str = DEFAULT_RESULTS) -> str:
+def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str]) -> str:
     """Return the command that adds effects (``sensor.effect``) to the file of a unit and runs the campaign.
 
     It also adds the effects that ``unit_overrides`` sets for this run, because that override has precedence.
@@ -347,19 +344,19 @@ def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], 
             others.append(override)
     overrides |= {unit: others} if others else {}
     rest = {**settings, "unit_overrides": overrides}
-    return _command("add", rest, [unit, *dict.fromkeys([*given, *effects])], results)
+    return _command("add", rest, [unit, *dict.fromkeys([*given, *effects])])
 
 
-def once_command(settings: Mapping[str, Any], unit: str, override: str, results: str = DEFAULT_RESULTS) -> str:
+def once_command(settings: Mapping[str, Any], unit: str, override: str) -> str:
     """Return the command that runs the campaign once with one more override of a unit."""
     overrides = settings.get("unit_overrides") or {}
     key = override.partition("=")[0]
     others = [text for text in overrides.get(unit, []) if text.partition("=")[0] != key]
-    once = {**settings, "unit_overrides": {**overrides, unit: [*others, override]}}
-    return run_command(once | ({"results": results} if results != DEFAULT_RESULTS else {}))
+    return run_command({**settings, "unit_overrides": {**overrides, unit: [*others, override]}})
 
 
-def _command(command: str, settings: Mapping[str, Any], words: Sequence[str], results: str) -> str:
+def _command(command: str, settings: Mapping[str, Any], words: Sequence[str]) -> str:
+    results = str(settings.get("results") or DEFAULT_RESULTS)
     folder = ["--results", results] if results != DEFAULT_RESULTS else []
     rest = {key: value for key, value in settings.items() if key not in ("campaign", "results")}
     return shlex.join([*_program(), command, str(settings.get("campaign", "demo")), *words, *folder, *_config(rest)])
@@ -370,7 +367,10 @@ def _program() -> list[str]:
 
 
 def _config(settings: Mapping[str, Any]) -> list[str]:
-    pairs = [f"{key}={_flow(value, top=True)}" for key, value in settings.items() if value]
+    results = settings.get("results")
+    stated = {k: v for k, v in settings.items() if v and k != "results"}
+    stated |= {"results": results} if results and results != DEFAULT_RESULTS else {}
+    pairs = [f"{key}={_flow(value, top=True)}" for key, value in stated.items()]
     return ["--config", *pairs] if pairs else []
 
 
