@@ -7,7 +7,7 @@ and how ``convert`` reads it), and the text of the file in Jinja2. The text has 
     sensors                    the calibrated sensors, by name
     remarks                    convention, omitted quantities, the remaining error, the held-out errors
     unit, document             name of the unit, its calibration
-    sheets, gravity_g          figures of each sensor (``sensors.SensorFigures``); local gravity, g
+    gravity_g                  local gravity, g
     noise                      ``sensors.noise``, of a format with ``noise: true``
 
 the functions of ``sensors.TEMPLATE_FUNCTIONS``, and the filters ``comment``, ``json``, ``yaml``, ``numbers``. The name
@@ -232,7 +232,7 @@ def _rendered(declared: Format, template: Template, exported: ExportedUnit) -> s
     available = {*sensors, "board"} if (exported.document.get("board") or {}).get("chips") else set(sensors)
     if without_counts or not set(declared.required) <= available:
         return None
-    about = {key: getattr(exported, key) for key in ("document", "sheets", "gravity_g")}
+    about = {key: getattr(exported, key) for key in ("document", "gravity_g")}
     about |= {"noise": noise(exported.noise_figures) if declared.noise else None, "sensors": sensors}
     about |= {"unit": exported.document["unit"], "remarks": _remarks(declared, sensors, exported)}
     return template.render(**{s: sensors.get(s) for s in SENSORS}, **about)

@@ -95,7 +95,6 @@ def render(
         implausible=[(r["unit"], s, names) for r in rows for s in SENSORS if (names := r.get(f"{s}_implausible"))],
         left_out=[(r["unit"], what) for r in rows if (what := r.get("left_out"))],
         incomplete=[(r["unit"], what) for r in rows if (what := r.get("incomplete"))],
-        ok=sum(row["status"] == "ok" for row in rows),
         passed=judged.count(True),
         not_passed=judged.count(False),
         judged=any(row.get("pass") is not None for row in rows if row["status"] == "ok"),

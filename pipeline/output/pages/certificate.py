@@ -312,7 +312,7 @@ def missing_for_dcc(report: JSON) -> list[str]:
     return [m["key"] for m in report["missing"]] + [key for key, name in DEMANDED.items() if not core[name]]
 
 
-def digital_certificate(unit: str, report: JSON) -> str | None:
+def digital_certificate(report: JSON) -> str | None:
     """Return ``certificates/<unit>.xml`` of a report of ``certificate``; None where a statement is missing."""
     if missing_for_dcc(report):
         return None
@@ -320,7 +320,6 @@ def digital_certificate(unit: str, report: JSON) -> str | None:
     results = [{**r, "quantities": [_quantity(q) for q in r["results"]], "tables": _tables(r)}
                for r in report["measurementResults"]]  # fmt: skip
     text: str = template("dcc.xml").render(
-        unit=unit,
         report=report,
         results=results,
         place=place if place in PLACES else "other",
