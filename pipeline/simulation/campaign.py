@@ -61,7 +61,7 @@ from pipeline.simulation.sensor import (
     drawn_effects,
     drawn_sensors,
 )
-from pipeline.simulation.trajectory import CommandedTurns, Gimbals, Planned, RestsAndMoves, random_errors, rotation_by
+from pipeline.simulation.trajectory import CommandedTurns, Gimbals, Planned, random_errors, rotation_by
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
 ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3  # of CSV files: rounding far below any noise
@@ -231,7 +231,6 @@ def _log(plan: Planned, bench: SimulatedBench, time: Values) -> dict[str, Any]:
         rate = np.linalg.norm(trajectory.pose(time).omega, axis=1)
         attitude = np.round(trajectory.quaternion(time), QUATERNION_DECIMALS)
         return {"table_attitude": attitude, "table_rate": np.round(rate, ANGLE_DECIMALS)}
-    assert isinstance(trajectory, RestsAndMoves)  # noqa: S101
     return {"table_rate": np.zeros(len(time))} if plan.role == "static" else {}
 
 

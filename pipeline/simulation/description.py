@@ -151,21 +151,18 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
             planned.append(Planned("validation", "validation", None, motion))
         planned += _static(course)
         return _with_transits(planned, course) if procedure == ONE_RECORDING else planned
-    attitudes: dict[str, Callable[[], Values]] = {
-        "orientations_24": orientations_24,
-        "six_positions": six_positions,
-        "multi_position": lambda: random_attitudes(course.positions, rng),
-    }
-    if procedure not in {*attitudes, FERRARIS, OF_A_SHEET}:
-        known = ", ".join((*TABLE_PROCEDURES, *attitudes, FERRARIS, OF_A_SHEET))
-        raise ConfigurationError(f"no procedure is called {procedure!r}; known: {known}")
     if procedure == OF_A_SHEET:
         return _listed(course, rng, hand_accuracy)
-    if procedure == FERRARIS:
-        moves = _faces_and_turns(course, rng, hand_accuracy)
-    else:
-        moves = _rests(attitudes[procedure](), course, rng, hand_accuracy)
-    planned = [Planned("recording", "rests", None, moves)]
+    moves: dict[str, Callable[[], RestsAndMoves]] = {
+        "orientations_24": lambda: _rests(orientations_24(), course, rng, hand_accuracy),
+        "six_positions": lambda: _rests(six_positions(), course, rng, hand_accuracy),
+        "multi_position": lambda: _rests(random_attitudes(course.positions, rng), course, rng, hand_accuracy),
+        FERRARIS: lambda: _faces_and_turns(course, rng, hand_accuracy),
+    }
+    if procedure not in moves:
+        known = ", ".join((*TABLE_PROCEDURES, *moves, OF_A_SHEET))
+        raise ConfigurationError(f"no procedure is called {procedure!r}; known: {known}")
+    planned = [Planned("recording", "rests", None, moves[procedure]())]
     if course.validation_s > 0.0:
         count = max(2, int(course.validation_s / (course.dwell_s + 2.0)))
         held_out = _rests(random_attitudes(count, rng), replace(course, warm_up_rest_s=0.0), rng, 0.0)
