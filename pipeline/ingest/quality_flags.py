@@ -121,8 +121,6 @@ def flag_clipped(table: Log, sensor: str, full_scale: float, flags: NDArray[np.u
     """Flag readings at full scale, g or deg/s; refuse those far beyond it."""
     notes = []
     for channel in TRIADS[sensor]:
-        if channel not in table.values:
-            continue
         values = table.values[channel]
         count = table.count_sizes.get(channel, 0.0)
         largest = max(float(values.max()), -float(values.min()))
@@ -162,8 +160,7 @@ def flag_flat_tops(table: Log, sensor: str, flags: NDArray[np.uint16]) -> list[N
     if set(TABLE_CHANNELS) & table.values.keys():
         return notes
     for channel in TRIADS[sensor]:
-        if (values := table.values.get(channel)) is None:
-            continue
+        values = table.values[channel]
         steps, ends = np.abs(np.diff(values)), (values.min(), values.max())
         same = steps == 0.0
         if ends[1] - ends[0] < FEWEST_STEPS * np.min(steps, where=~same, initial=np.inf):
@@ -187,7 +184,7 @@ def find_stuck(table: Log, sensor: str, flags: NDArray[np.uint16]) -> dict[str, 
 
     ``IngestError``: an axis is constant in half of the rows or more, while the other axes of its sensor change.
     """
-    neighbours = {c: v[1:] == v[:-1] for c in TRIADS[sensor] if (v := table.values.get(c)) is not None}
+    neighbours = {c: table.values[c][1:] == table.values[c][:-1] for c in TRIADS[sensor]}
     found = {}
     for channel, same in neighbours.items():
         if not _in_a_row(same, SHORTEST_RUN - 1):
@@ -303,7 +300,7 @@ def examine(table: Log, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[
     flags = np.zeros(len(table.time_ns), np.uint16) if table.flags is None else table.flags.copy()
     notes = flag_gaps(table, flags, checks)
     stuck: dict[str, Index] = {}
-    for name in TRIADS:
+    for name in (s for s, triad in TRIADS.items() if triad[0] in table.values):
         if sensor is not None:
             notes += flag_clipped(table, name, sensor.of(name).full_scale, flags)
         notes += flag_flat_tops(table, name, flags)
@@ -320,12 +317,9 @@ def _check_rate(table: Log, checks: Checks) -> None:
     ratio = interval_us * checks.rate_hz / 1e6
     if abs(ratio - 1.0) <= RATE_TOLERANCE:
         return
-    unit = ""
-    for factor, times in _OTHER_FACTORS.items():
-        if abs(ratio * factor - 1.0) <= RATE_TOLERANCE:
-            unit = f"; the numbers look like {times}"
-    message = f"the median interval is {interval_us:g} us,"
-    message += f" and ingest.checks.rate_hz of {checks.rate_hz:g} Hz expects {1e6 / checks.rate_hz:g} us{unit}"
+    looks = [times for factor, times in _OTHER_FACTORS.items() if abs(ratio * factor - 1.0) <= RATE_TOLERANCE]
+    message = f"the median interval is {interval_us:g} us, and ingest.checks.rate_hz of {checks.rate_hz:g} Hz expects"
+    message += f" {1e6 / checks.rate_hz:g} us{f'; the numbers look like {looks[0]}' if looks else ''}"
     hint = "correct ingest.csv.columns.time.unit or ingest.checks.rate_hz"
     raise IngestError(message, table.path, code="wrong_rate", hint=hint)
 
