@@ -235,15 +235,14 @@ class SensorSignals:
         return SensorSignals(self.time[rows], self.readings[rows], self.rates, self.noise)
 
 
-def fit_clocks(sensor: Log, log: Log) -> ClockFit:
-    """Return offset and drift of the table's clock; the times count from the first sample of each log.
+def fit_clocks(sensor: Log, log: Log, signals: Signals) -> ClockFit:
+    """Return offset and drift of the clock of a table's ``log``; the times count from the first sample of each log.
 
     Raises ``IngestError`` for a sensor without gyroscope, and for logs that do not show the same motion, or that fit
     equally well at several offsets.
     """
     if "gyro_x" not in sensor.values:
         raise IngestError("a table's log with its own clock needs a gyroscope to be aligned", log.path, code="no_sync")
-    signals = signals_of(log)
     sensed = _sensor_signals(sensor, signals)
     look = sensed.part(slice(None, None, max(1, len(sensed.time) // SAMPLES_OF_A_LOOK)))
     places = _places(look, signals)
@@ -397,11 +396,12 @@ def align(sensor: Log, log: Log) -> Log:
     if len(log_time) < MIN_SPLINE_ROWS:
         message = f"the table's log has {len(log_time)} rows; at least {MIN_SPLINE_ROWS} are needed"
         raise IngestError(message, log.path, code="no_sync")
-    if signals_of(log).resting:
+    signals = signals_of(log)
+    if signals.resting:
         tau = np.clip(t, 0.0, log_time[-1])
         note = Note("N-SYNC", len(t), 0, 0, "the table rests throughout its log: there is no motion to align by")
         return _merged(sensor, log, slice(0, len(t)), tau, {}, [note])
-    fit = fit_clocks(sensor, log)
+    fit = fit_clocks(sensor, log, signals)
     tau = fit.table_time(t)
     inside = np.flatnonzero((tau >= 0) & (tau <= log_time[-1]))
     if inside.size < 2:
@@ -446,8 +446,9 @@ def follow_program(table: Log, program: Sequence[ProgramRest | ProgramTurn | Rep
     commanded = Program([pause, *_flat(program), pause])
     times = np.arange(0.0, commanded.duration, PROGRAM_STEP_S)
     angle, rate, *_ = commanded.at(times)
-    log = {"table_angle": angle, "table_rate": rate}
-    fit = fit_clocks(table, Log(table.path, np.rint(times * 1e9).astype(np.int64), log, table.source))
+    values = {"table_angle": angle, "table_rate": rate}
+    log = Log(table.path, np.rint(times * 1e9).astype(np.int64), values, table.source)
+    fit = fit_clocks(table, log, signals_of(log))
     t = seconds_of(table)
     tau, shifts, drift, begun = _place(table, commanded, t, fit.table_time(t))
     angle, rate, *_ = commanded.at(tau)
@@ -555,5 +556,4 @@ def _about_the_moves(table: Log, commanded: Values) -> Values:
     fitted = np.linalg.lstsq(columns, rates, rcond=None)[0]
     axis = int(np.argmax(np.abs(fitted[0])))
     scale, bias = fitted[:, axis]
-    about: Values = (rates[:, axis] - bias) / scale
-    return about
+    return np.asarray((rates[:, axis] - bias) / scale)
