@@ -116,8 +116,7 @@ class Environment:
             phase = phase + np.clip((time - start) / (end - start), 0.0, 1.0)
         triangle = 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * phase))
         warm = self.warm_up * (1.0 - np.exp(-time / self.warm_up_time))
-        total: Values = self.ambient + warm + self.drift * room + self.ramp * triangle
-        return total
+        return np.asarray(self.ambient + warm + self.drift * room + self.ramp * triangle)
 
     def reading(self, time: Values, rng: np.random.Generator) -> Values:
         """Return the thermometer's reading: (n,) array, degC."""

@@ -200,8 +200,7 @@ class SimulatedSensor:
         """Round the reading to whole counts and clip it at full scale: (n, 3) array, g or deg/s."""
         counts = np.round(reading * self.data_sheet.counts_per_unit)
         top = self.data_sheet.full_scale * self.data_sheet.counts_per_unit
-        kept: Values = np.clip(counts, -top, top - 1.0) / self.data_sheet.counts_per_unit
-        return kept
+        return np.asarray(np.clip(counts, -top, top - 1.0) / self.data_sheet.counts_per_unit)
 
 
 def decimals_of(data_sheet: DataSheet) -> int:
@@ -261,8 +260,7 @@ def _matrix(data_sheet: DataSheet, given: Mapping[str, Any], mounting: Values, r
     lower[[1, 2, 2], [0, 0, 1]] = np.radians(np.array(given.get("non_orthogonality_deg", skew), float))
     angles = np.array(given.get("mounting_deg", mounting), float)
     x, y, z = (rotation_about(axis, np.array([a]))[0] for axis, a in zip(np.eye(3), angles, strict=True))
-    matrix: Values = (z @ y @ x).T @ lower @ np.diag(scale)
-    return matrix
+    return np.asarray((z @ y @ x).T @ lower @ np.diag(scale))
 
 
 def _limited(limit: float, rng: np.random.Generator) -> Values:

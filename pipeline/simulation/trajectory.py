@@ -115,8 +115,7 @@ class TurnErrors:
         """Return the true turn axis: (3,) unit vector, body frame."""
         u = np.zeros(3)
         u[[axis, (axis + 1) % 3, (axis + 2) % 3]] = 1.0, *self.direction
-        unit: Values = u / np.linalg.norm(u)
-        return unit
+        return np.asarray(u / np.linalg.norm(u))
 
     def force(self, program: Program, time: Values) -> Values | None:
         """Return the specific force of the plate's vibration: (n, 3) array, g, or None without vibration."""
@@ -124,8 +123,7 @@ class TurnErrors:
             return None
         phase = 2.0 * np.pi * (self.vibration_frequency * time[:, None] + np.arange(3) / 3.0)
         moving = program.at(time)[1] != 0.0
-        shaken: Values = self.shaking * moving[:, None] * np.sin(phase)
-        return shaken
+        return np.asarray(self.shaking * moving[:, None] * np.sin(phase))
 
     def motion(self, program: Program, time: Values) -> tuple[Values, Values, Values]:
         """Return the true angle (deg), rate (deg/s) and acceleration (deg/s^2): (n,) arrays."""

@@ -263,8 +263,7 @@ def _json(content: Any, indent: int = 2) -> str:  # noqa: ANN401
 def _yaml(content: Any) -> str:  # noqa: ANN401
     """Return YAML with keys in their order and short lists on one line, by the faster libyaml if it is available."""
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-    text: str = yaml.dump(as_json(content), Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
-    return text
+    return str(yaml.dump(as_json(content), Dumper=dumper, sort_keys=False, default_flow_style=None, width=120))
 
 
 def _numbers(values: Any, form: str = "%.17g", separator: str = " ") -> str:  # noqa: ANN401

@@ -85,7 +85,7 @@ def render(
     for failure in failures:
         cause = f"{failure.get('code')} in stage {failure.get('stage') or 'unknown'}"
         causes.setdefault(cause, []).append(str(failure.get("unit")))
-    text: str = template("campaign.html").render(
+    return template("campaign.html").render(
         campaign=campaign,
         published=published,
         published_names=None if published is None else script_data(sorted(published)),
@@ -132,7 +132,6 @@ def render(
         kept=sorted(set(frame) - set(SUMMARY_COLUMNS)),
         page=page,
     )
-    return text
 
 
 def judged_on(rows: Sequence[Mapping[str, Any]], sensors: Sequence[str] = SENSORS) -> str:

@@ -302,8 +302,7 @@ def certificate_page(unit: str, report: JSON) -> str:
     # A string of a style sheet: all characters but letters and digits are written by their number.
     codes = Markup("".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in sheet))  # noqa: S704
     lacking = missing_for_dcc(report)
-    page: str = template("certificate.html").render(unit=unit, report=report, sheet=codes, lacking=lacking)
-    return page
+    return template("certificate.html").render(unit=unit, report=report, sheet=codes, lacking=lacking)
 
 
 def missing_for_dcc(report: JSON) -> list[str]:
@@ -319,13 +318,12 @@ def digital_certificate(report: JSON) -> str | None:
     place = report["administrativeData"]["coreData"]["performanceLocation"]
     results = [{**r, "quantities": [_quantity(q) for q in r["results"]], "tables": _tables(r)}
                for r in report["measurementResults"]]  # fmt: skip
-    text: str = template("dcc.xml").render(
+    return template("dcc.xml").render(
         report=report,
         results=results,
         place=place if place in PLACES else "other",
         filled=lambda value: " ".join(str(value).split()),
     )
-    return text
 
 
 def dsi_unit(unit: str) -> tuple[float, str] | None:

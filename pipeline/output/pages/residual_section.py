@@ -238,9 +238,8 @@ def harmonic_noise(residual: Residual, white: Values, wander: Values, time: floa
     ``time``: correlation time of the wander, s.
     """
     motion = residual.motion
-    assert motion.angle is not None  # noqa: S101
     duration = max(float(np.ptp(motion.time)), 1e-9)
-    turns = max(float(np.abs(np.diff(motion.angle)).sum()) / 360.0, 1.0)
+    turns = max(float(np.abs(np.diff(np.asarray(motion.angle))).sum()) / 360.0, 1.0)
     frequency = np.arange(HARMONICS + 1) * turns / duration
     spectrum = 2.0 * float(wander.max()) ** 2 * time / (1.0 + (2.0 * np.pi * frequency * time) ** 2)
     of_white = float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(residual.angle_bins[1], 1))) / RESIDUAL_BINS

@@ -100,7 +100,7 @@ def render(
         sensors.append(shown)
     determining = settings.only(settings.model_fields_set - {"stated", "certificate"})
     determining["config_sha256"] = settings.stated.config_sha256
-    page: str = template("unit.html").render(
+    return template("unit.html").render(
         calibration=calibration,
         ok=ok,
         problems=kinds_of(row | {"incomplete": "; ".join(f"{r['stage']}: {r['message']}" for r in incomplete)}),
@@ -125,7 +125,6 @@ def render(
         command=run_command(settings.stated.run) if settings.stated.run else None,
         settings_text=json_text(dict(sorted(determining.items()))),
     )
-    return page
 
 
 def found_mounting(calibration: JSON) -> JSON | None:
