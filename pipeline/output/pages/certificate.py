@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from itertools import repeat
+from itertools import product, repeat
 from operator import attrgetter
 from typing import Any
 
@@ -240,10 +240,9 @@ def _supplied(calibration: JSON, sensor: str, held_out: JSON) -> str:
 def _relations(part: JSON) -> Iterator[tuple[str, Parameter]]:
     """Yield each entry of the matrix with the element of K, its inverse, that has the same indices."""
     found = {p.name: p for p in reading_errors(part)}
-    for row in AXES:
-        for column in AXES:
-            name = f"scale_factor_error_{row}" if row == column else f"cross_axis_{row}{column}"
-            yield f"matrix_{row}{column}", found[name]
+    for row, column in product(AXES, repeat=2):
+        name = f"scale_factor_error_{row}" if row == column else f"cross_axis_{row}{column}"
+        yield f"matrix_{row}{column}", found[name]
 
 
 def _quantities(part: JSON) -> list[JSON]:
