@@ -21,6 +21,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ import imu_logs
 from imu_logs.files import is_message_log
 from imu_logs.log import Log
 from imu_logs.profile import TIME, Checks, CsvFormat, checks_of, csv_formats
-from imu_logs.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
+from imu_logs.units import ATTITUDE, SCALARS, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError, InputError, MissingInputError, shortened
 from pipeline.core.records import (
     BETWEEN_ATTITUDES_S,
@@ -196,11 +197,6 @@ def of_one_sensor(procedure: Procedure, files: Collection[str]) -> str:
     return f"; of a unit without {lacking[0]}, set method.{lacking[0]}=null" if len(lacking) == 1 and others else ""
 
 
-def _copy(values: Mapping[str, Values], channel: str) -> Values | None:
-    """Return a copy of a channel, which does not keep the other columns of its file in memory; None without it."""
-    return values[channel].copy() if channel in values else None
-
-
 def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | None, checks: Checks) -> Recording:
     """Convert a table of channels to a recording in body axes, with quality flags; removes the channels from ``table``.
 
@@ -223,14 +219,16 @@ def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | N
     if left_handed:  # not a rotation: some sensors have left-handed axes, so that the map is used
         detail = ", ".join(f"[{', '.join(maps[s])}] of the {s}" for s in left_handed)
         notes.insert(0, Note("N-LEFTHANDED", len(left_handed), 0, 0, f"left-handed axis map: {detail}"))
-    readings: dict[str, Values | None] = dict.fromkeys(TRIADS)
+    channels: dict[str, Any] = {}
     for which, triad in TRIADS.items():
         stacked = _stack(values, triad)
         if stacked is not None:
-            readings[which] = in_body_axes(maps[which], stacked)
+            channels[which] = in_body_axes(maps[which], stacked)
             continue
         detail = f"the file has no column that the profile assigns to the {which}: it cannot calibrate this sensor"
         notes.append(Note("N-ABSENT", len(table.time_ns), 0, 0, detail))
+    # copies, which do not keep the other columns of the file in memory
+    channels |= {channel: values[channel].copy() for channel in SCALARS if channel in values}
     recording = Recording(
         name=name,
         role=entry.role,
@@ -238,15 +236,11 @@ def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | N
         setup=entry.setup or "",
         kind=entry.kind or "",
         time_ns=table.time_ns,
-        accelerometer=readings["accelerometer"],
-        gyroscope=readings["gyroscope"],
-        temperature=_copy(values, "temperature"),
-        table_angle=_copy(values, "table_angle"),
-        table_rate=_copy(values, "table_rate"),
         table_attitude=_stack(values, ATTITUDE),
         flags=flags,
         source=table.source,
         notes=(*table.notes, *notes),
+        **channels,
     )
     if recording.axis is None and recording.table_attitude is not None and recording.table_rate is None:
         rate = rate_of_attitude(recording.time * recording.table_seconds, recording.table_attitude)
