@@ -61,7 +61,7 @@ def test_effects_that_one_run_had_are_kept_by_the_command_that_adds_more() -> No
         "campaign": "my bench",
         "unit_overrides": {"U1": ["filter.order=1", "effects.gyroscope=[a,b]"], "U2": ["filter.order=3"]},
     }
-    command = words(add_command(settings, "U1", ["gyroscope.c"], "/out"))
+    command = words(add_command({**settings, "results": "/out"}, "U1", ["gyroscope.c"]))
     assert command[:8] == ["-m", "pipeline", "add", "my bench", "U1", "gyroscope.a", "gyroscope.b", "gyroscope.c"]
     assert command[8:11] == ["--results", "/out", "--config"]
     assert parse_config(command[11:]) == {"unit_overrides": {"U2": ["filter.order=3"], "U1": ["filter.order=1"]}}

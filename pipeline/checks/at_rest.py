@@ -127,7 +127,7 @@ def _doubted(
                     f"file allows {most:.3g}: is the static recording of this unit?"
                 )
     notes = [Note("N-REFERENCE", recording.samples, 0, 0, detail) for detail in details]
-    return replace(recording, notes=(*recording.notes, *notes))
+    return recording.noted(*notes)
 
 
 def _digit(reading: Values) -> Values:
@@ -166,9 +166,7 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_model:
         rate = np.abs(_blocks(recording, recording.table_rate)).max(axis=1)
         moving = rate >= RATE_AT_REST_DPS
         why = f"the table turns at up to {rate.max():.3g} deg/s" if moving.any() else ""
-    for sensor in SENSORS:
-        if recording.reading(sensor) is None:
-            continue
+    for sensor in recording.readings:
         moves, what = _moving(recording, sensor, sensor_model.of(sensor), rests_of[sensor])
         why = why or (what if moves.any() else "")
         moving |= moves
@@ -189,7 +187,7 @@ def _resting(recording: Recording, rests_of: Mapping[str, Values], sensor_model:
     t = recording.time
     detail = f"only {place(recording, start, stop - 1)} are used of {t[0]:.6g} to {t[-1]:.6g} s: the rest moves; {why}"
     note = Note("N-MOVED", left_out, 0, 0, detail, float(t[0]), float(t[-1]))
-    return replace(recording.select(slice(start, stop)), notes=(*recording.notes, note))
+    return recording.select(slice(start, stop)).noted(note)
 
 
 def _moving(recording: Recording, sensor: str, sheet: DataSheet, rests: Values) -> tuple[Mask, str]:
@@ -246,7 +244,7 @@ def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
         if not (long := long[:: len(long) // MIN_RESTS_OF_SCATTER + 1]).size:
             continue
         rows = np.concatenate([rows[starts[k] : ends[k]] for k in long])
-        found = {s: reading for s in SENSORS if (reading := recording.reading(s)) is not None}
+        found = recording.readings
         parts = _moments(np.concatenate([reading[rows] for reading in found.values()], axis=1), (ends - starts)[long])
         for k, sensor in enumerate(found):
             moments[sensor].append(parts[..., 3 * k : 3 * k + 3])
@@ -303,10 +301,8 @@ def _check_copies(recording: Recording) -> None:
     equally frequent by chance, so the difference of their shares of k changes counts. Its standard deviation by chance
     is at most ``sqrt(0.5 / k)``, that of two digits of equal frequency.
     """
-    for sensor, (one, two) in itertools.product(SENSORS, itertools.combinations(range(3), 2)):
-        reading = recording.reading(sensor)
-        if reading is None:
-            continue
+    pairs = itertools.combinations(range(3), 2)
+    for (sensor, reading), (one, two) in itertools.product(recording.readings.items(), pairs):
         a, b = reading[:, one], reading[:, two]
         if np.count_nonzero(np.abs(a) == np.abs(b)) <= MIN_COPIED_SHARE * MIN_AXIS_SAMPLES:
             continue  # in any rows: too few for a refusal

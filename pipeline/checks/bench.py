@@ -14,11 +14,9 @@ Gravity determines them before any calibration. In a turn about a level axis the
 
     f(A) = c + p cos A + q sin A + d(r),    p = K u,   q = K (u x a),   c = b + K (component of gravity along a)
 
-where
-
-A : table angle, counted right-handed about body axis a u : body axis that points up at A = 0 K : inverse of the
-calibration matrix, the unit matrix to a few percent; b: bias d : in a turn between rests, a combination of r (rate
-dependence), |r| (vibration) and r^2 (lever arms), with rate r
+where A counts right-handed about the body axis a, u points up at A = 0, K is the inverse of the calibration matrix (the
+unit matrix to a few percent) and b the bias. In a turn between rests, d combines r (rate dependence), |r| (vibration)
+and r^2 (lever arms) of the rate r.
 
 ``q x p`` points along the turn axis, and p and q determine face and zero. If the angle counts left-handed, q changes
 its sign. The gain of the gyroscope against the table's rate points along the turn axis, too:
@@ -111,11 +109,9 @@ class TurnMounting:
 
 def stated_bench(entry: RecordingFile | None, table: Table, axis: str) -> TurnMounting:
     """Return the mounting that a recording's entry in the procedure states; the table states sense and zero else."""
-    if entry is None:
-        return TurnMounting(axis, usual_up(axis), table.sense, table.zero_deg)
-    sense = table.sense if entry.sense is None else entry.sense
-    zero_deg = table.zero_deg if entry.zero_deg is None else entry.zero_deg
-    return TurnMounting(axis, entry.up or usual_up(axis), sense, zero_deg)
+    sense = table.sense if entry is None or entry.sense is None else entry.sense
+    zero_deg = table.zero_deg if entry is None or entry.zero_deg is None else entry.zero_deg
+    return TurnMounting(axis, (entry and entry.up) or usual_up(axis), sense, zero_deg)
 
 
 def found_bench(fit: TurnFit, axis: str) -> TurnMounting | None:

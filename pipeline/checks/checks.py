@@ -38,7 +38,7 @@ from pipeline.checks.at_rest import check_axes, check_static, with_rates_at_rest
 from pipeline.checks.evidence import place, refusal
 from pipeline.checks.mounting import check_mounting
 from pipeline.checks.reference import check_motion, check_turns
-from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Note, Recording, Values, finite_rows
+from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Note, Recording, Values, ends_of_runs, finite_rows
 from pipeline.core.settings import Settings, Table
 from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.physics.kinematics import normal_gravity_g
@@ -84,8 +84,7 @@ def refined(recordings: Sequence[Recording]) -> list[Recording]:
     out = []
     for r in recordings:
         note = Note("N-STEPS", r.samples, 0, r.samples, f"{r.name}: {detail}")
-        fine = np.interp(r.time, nodes, curve)
-        out.append(replace(r, temperature=fine, notes=(*r.notes, note)))
+        out.append(replace(r.noted(note), temperature=np.interp(r.time, nodes, curve)))
     return out
 
 
@@ -204,7 +203,7 @@ def check_recordings(recordings: Sequence[Recording], settings: Settings) -> lis
     """
     _check_shared_rows(recordings)
     check_axes(recordings)
-    recordings = _with_settling(_with_steps(with_rates_at_rest(recordings)))
+    recordings = [*map(_with_settling, _with_steps(with_rates_at_rest(recordings)))]
     turns, delays = check_turns(check_static(recordings, settings), settings)
     checked = refined(check_motion(check_mounting(turns, settings), delays, settings))
     return _placed(checked, settings.table)
@@ -218,8 +217,9 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
         for step in np.unique(steps[steps > 0.0]):
             off = np.sqrt(3.0) * rounding[steps == step].max()  # half-width of a rectangle
             axes = ", ".join(name for name, s in zip(TRIADS[sensor], steps, strict=True) if s == step)
-            whole = (d for d in range(MAX_SIGNIFICANT_DIGITS) if _is_whole(step * 10.0**d))
-            digits = next((f", {d} decimal{'s' * (d != 1)}," for d in whole), "")
+            shifted = step * 10.0 ** np.arange(MAX_SIGNIFICANT_DIGITS)
+            whole = np.flatnonzero(np.abs(shifted - np.rint(shifted)) < SAME_STEP * shifted).tolist()
+            digits = f", {whole[0]} decimal{'s' * (whole[0] != 1)}," if whole else ""
             detail = (
                 f"{axes}: steps of {step:.3g} {SENSOR_UNITS[sensor]}{digits} and noise of less than half a step: "
                 f"means are off by up to {off:.3g} {SENSOR_UNITS[sensor]}, however long the "
@@ -227,33 +227,25 @@ def _with_steps(recordings: Sequence[Recording]) -> Sequence[Recording]:
                 "smaller range"
             )
             k, first = next((k, r) for k, r in enumerate(noted) if r.reading(sensor) is not None)
-            noted[k] = replace(first, notes=(*first.notes, Note(RESOLUTION_NOTE, first.samples, 0, 0, detail)))
+            noted[k] = first.noted(Note(RESOLUTION_NOTE, first.samples, 0, 0, detail))
     return noted
 
 
-def _with_settling(recordings: Sequence[Recording]) -> Sequence[Recording]:
+def _with_settling(recording: Recording) -> Recording:
     """Note an accelerometer that settles in the rests by hand, with the time that is left out or would be needed."""
-    noted = list(recordings)
-    for k, recording in enumerate(recordings):
-        by_hand = recording.role in {"rests", "validation"} and recording.logged_rate is None
-        settling = settling_of(recording) if by_hand else None
-        if settling is None:
-            continue
-        detail = f"after moves the accelerometer settles with a time constant of {settling.time_s:.2g} s,"
-        detail += f" as with a slow filter; it is settled {settling.left_out_s:.2g} s after a rest was found"
-        detail += (
-            f", and the rests are too short for that: their means are off by {settling.left_g:.2g} g. Rest longer, or "
-            "log without this filter"
-            if settling.clear
-            else ", and this time is left out of every rest"
-        )
-        note = Note("N-REFERENCE" if settling.clear else "N-SETTLING", recording.samples, 0, 0, detail)
-        noted[k] = replace(recording, notes=(*recording.notes, note))
-    return noted
-
-
-def _is_whole(value: float) -> bool:
-    return abs(value - round(value)) < SAME_STEP * abs(value)
+    by_hand = recording.role in {"rests", "validation"} and recording.logged_rate is None
+    settling = settling_of(recording) if by_hand else None
+    if settling is None:
+        return recording
+    detail = f"after moves the accelerometer settles with a time constant of {settling.time_s:.2g} s,"
+    detail += f" as with a slow filter; it is settled {settling.left_out_s:.2g} s after a rest was found"
+    detail += (
+        f", and the rests are too short for that: their means are off by {settling.left_g:.2g} g. Rest longer, or "
+        "log without this filter"
+        if settling.clear
+        else ", and this time is left out of every rest"
+    )
+    return recording.noted(Note("N-REFERENCE" if settling.clear else "N-SETTLING", recording.samples, 0, 0, detail))
 
 
 def _placed(recordings: list[Recording], table: Table) -> list[Recording]:
@@ -261,7 +253,7 @@ def _placed(recordings: list[Recording], table: Table) -> list[Recording]:
     latitude, azimuth = table.latitude_deg, table.azimuth_deg
     if latitude is None:
         return recordings
-    gravity, notes = normal_gravity_g(float(latitude)), []
+    gravity = normal_gravity_g(float(latitude))
     measured = [k for k, r in enumerate(recordings) if r.accelerometer is not None]
     if measured and table.gravity_g == 1.0 and abs(gravity - 1.0) >= SAME_GRAVITY_G:
         detail = (
@@ -269,20 +261,19 @@ def _placed(recordings: list[Recording], table: Table) -> list[Recording]:
             "and 0.000315 g less for each km of height. Scale and bias of the accelerometer are then in units of local "
             f"gravity, {abs(gravity - 1.0):.3%} off standard g: set table.gravity_g={gravity:.5f} for standard g"
         )
-        notes.append((measured[0], Note("N-GRAVITY", 1, 0, 0, detail)))
+        recordings[measured[0]] = recordings[measured[0]].noted(Note("N-GRAVITY", 1, 0, 0, detail))
     turns = [(k, r) for k, r in enumerate(recordings) if r.axis and not r.up and r.role != "validation"]
     if turns and table.azimuth_of == "turn_axis" and azimuth is not None:
         ends = [f"body {r.axis} to {(azimuth + 90.0 * (1 - r.sense)) % 360.0:g} deg in {r.name}" for _, r in turns]
         detail = "Earth's rotation is in the model: by table.azimuth_deg and the sense of the encoder the shaft points"
         detail += f" with {', '.join(ends)}, clockwise from north; if it does not, correct table.azimuth_deg by 180 deg"
-        notes.append((turns[0][0], Note("N-AZIMUTH", len(turns), 0, 0, detail)))
-    for k, note in notes:
-        recordings[k] = replace(recordings[k], notes=(*recordings[k].notes, note))
+        k, first = turns[0]
+        recordings[k] = first.noted(Note("N-AZIMUTH", len(turns), 0, 0, detail))
     return recordings
 
 
 def _check_shared_rows(recordings: Sequence[Recording]) -> None:
-    recordings = [r for r in recordings if r.accelerometer is not None or r.gyroscope is not None]
+    recordings = [r for r in recordings if r.readings]
     decimals = [_decimals(r) for r in recordings]
     for coarser in sorted({tuple(map(min, x, y)) for x, y in itertools.combinations(decimals, 2)}, reverse=True):
         _check_at(recordings, coarser)
@@ -344,16 +335,15 @@ def _check_pair(one: Recording, two: Recording, first: Index, second: Index) -> 
     first, second = first[order], second[order]
     common, longest = len(first), max(one.samples, two.samples)
     ahead = (np.diff(first) <= APART) & (np.diff(second) > 0) & (np.diff(second) <= APART)
-    edges = np.flatnonzero(np.diff(ahead, prepend=False, append=False))
-    if not edges.size:
+    starts, stops = ends_of_runs(ahead)
+    if not starts.size:
         return
-    lengths = edges[1::2] - edges[::2] + 1
-    best = int(np.argmax(lengths))
-    count = int(lengths[best])
+    best = int(np.argmax(stops - starts))
+    a, b = int(starts[best]), int(stops[best])
+    count = b - a + 1
     chance = APART * common / longest
     if count < MIN_STEP_ROWS or (count < common / 2 and chance < 1.0 and chance ** (count - 1) > EXPECTED_CHANCE_RUNS):
         return
-    a, b = int(edges[2 * best]), int(edges[2 * best + 1])
     late, early = (two, one) if two.role == "validation" or one.role != "validation" else (one, two)
     spans = {one.name: (first[a], first[b]), two.name: (second[a], second[b])}
     rows, copied = (place(r, int(spans[r.name][0]), int(spans[r.name][1])) for r in (late, early))

@@ -122,10 +122,7 @@ def gaps(recording: Recording) -> Mask:
 
 @once_of_log
 def of_table(recording: Recording) -> tuple[Channel, ...]:
-    """Return the rotation by the table's log: its rate, and the angle of a turn or the attitude of held-out motion.
-
-    In held-out motion the rate is a magnitude.
-    """
+    """Return the rotation by the table's log: rate and angle of a turn; of held-out motion |rate| and attitude."""
     channels, turns = [], recording.axis is not None
     rate, angle, attitude = recording.table_rate, recording.table_angle, recording.table_attitude
     if rate is not None:

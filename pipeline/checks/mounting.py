@@ -59,8 +59,7 @@ class _Departure:
 def check_mounting(recordings: Sequence[Recording], settings: Settings) -> list[Recording]:
     """Return the recordings of a unit, in body axes, with the table's angle and rate by the convention.
 
-    ``IngestError``: the mounting of a turn differs from
-    the stated one and gravity does not determine it, or accelerometer and gyroscope contradict each other.
+    ``IngestError``: a mounting differs from the stated one, or accelerometer and gyroscope contradict each other.
     """
     table, sensor = settings.table, settings.sensor
     seated = table.seat_deg is not None
@@ -205,7 +204,7 @@ def _turned_attitude(recording: Recording) -> Recording:
     names = ", ".join(nearest_axis(row) for row in F)
     detail = f"the attitude is turned to the axes of the unit: the table's x, y and z are body {names}"
     note = Note("N-FOUND", recording.samples, 0, 0, detail)
-    return replace(recording, table_attitude=np.asarray(attitude, np.float64), notes=(*recording.notes, note))
+    return replace(recording.noted(note), table_attitude=np.asarray(attitude, np.float64))
 
 
 def _negated(turns: Sequence[TurnRecording], tolerance: float) -> bool:
@@ -230,18 +229,17 @@ def _applied(
 ) -> Recording:
     """Return the recording with angle and rate by the convention, with notes on that and its doubt.
 
-    ``as_found``: the difference from the stated mounting and the hint; empty where the stated one is applied. ``ways``:
-    the settings that describe the mountings that were found.
+    ``as_found``: the difference from the stated mounting and the hint; empty where the stated one is applied.
     """
     recording, bench = turn.recording, turn.stated
     angle, rate = recording.table_angle, recording.table_rate
-    notes = [*recording.notes, *([doubt] if doubt else [])]
+    notes = [doubt] if doubt else []
     logged = angle is not None and recording.accelerometer is not None
     if turn.fit.unknown and logged and recording.role != "gyroscope":  # that needs neither face nor zero
         detail = f"upward face, turn axis and zero are taken as stated: {turn.fit.unknown}"
         notes.append(Note("N-MOUNTING", 1, 0, 0, detail))
     if bench.conventional and not as_found:
-        return replace(recording, notes=tuple(notes)) if len(notes) > len(recording.notes) else recording
+        return recording.noted(*notes) if notes else recording
     detail = f"{as_found or 'as stated'}, {words(bench)}:"
     detail += f" the angle used is {bench.sense:+d} times the logged one, {bench.offset:+.6g} deg"
     if bench.vertical:
@@ -250,7 +248,7 @@ def _applied(
     notes.append(Note(code, recording.samples, 0, 0, detail, settings=settings))
     angle = None if angle is None else bench.sense * angle + bench.offset
     rate, up = None if rate is None else bench.sense * rate, bench.up if bench.vertical else ""
-    return replace(recording, up=up, sense=bench.sense, table_angle=angle, table_rate=rate, notes=tuple(notes))
+    return replace(recording.noted(*notes), up=up, sense=bench.sense, table_angle=angle, table_rate=rate)
 
 
 def words(bench: TurnMounting) -> str:
@@ -261,7 +259,7 @@ def words(bench: TurnMounting) -> str:
 
 
 def _departure(turn: TurnRecording, tolerance: float, lean: float) -> _Departure | None:
-    """Return the difference between the mounting of a turn and the stated one, or None."""
+    """Return the difference of a turn; ``lean``: deg, most by which the readings may show its axis off a body axis."""
     if turn.fit.vertical is not None or turn.stated.vertical:
         return _vertical(turn) or _gyroscope_sense(turn)
     return _axis(turn, tolerance, lean) or (
@@ -270,7 +268,6 @@ def _departure(turn: TurnRecording, tolerance: float, lean: float) -> _Departure
 
 
 def _axis(turn: TurnRecording, tolerance: float, lean: float) -> _Departure | None:
-    """Return the difference of the turn axis; ``lean``: deg, largest by which the readings may show it off an axis."""
     axis, fit, name = turn.stated.axis, turn.fit, turn.name
     direction = fit.turn_axis if fit.turn_axis is not None else fit.gain
     if direction is None:
@@ -300,7 +297,6 @@ def _gyroscope_sense(turn: TurnRecording) -> _Departure | None:
 
 
 def _face(turn: TurnRecording, found: TurnMounting, tolerance: float) -> _Departure | None:
-    """Return the difference of sense, upward face or zero."""
     stated, allowed = turn.stated, turn.tolerance_deg
     off = (found.offset - stated.offset + 180.0) % 360.0 - 180.0
     if found.sense == stated.sense:

@@ -326,8 +326,7 @@ def check_motion(recordings: Sequence[Recording], delays: Mapping[str, Delay], s
 def _with_notes(
     recordings: Sequence[Recording], found: Mapping[str, tuple[list[Note], Delay | None]]
 ) -> list[Recording]:
-    notes = {name: notes for name, (notes, _) in found.items() if notes}
-    return [replace(r, notes=(*r.notes, *notes[r.name])) if r.name in notes else r for r in recordings]
+    return [r.noted(*found[r.name][0]) if r.name in found and found[r.name][0] else r for r in recordings]
 
 
 class _Gyroscope:
@@ -377,9 +376,7 @@ class _Gyroscope:
 @once
 def _slopes(recording: Recording) -> Values:
     """Return gain and bias of each axis of a gyroscope by the table's rate: (2, 3) array; zeros if it is constant."""
-    reading, rate = recording.gyroscope, recording.logged_rate
-    assert reading is not None  # noqa: S101
-    assert rate is not None  # noqa: S101
+    reading, rate = np.asarray(recording.gyroscope), np.asarray(recording.logged_rate)
     change = rate - median(rate)
     if largest_but(np.abs(change), 100) < LEAST_RATE_DPS:
         return np.zeros((2, 3))

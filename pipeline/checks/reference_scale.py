@@ -145,10 +145,7 @@ def check_scale_of_turn(recording: Recording, limits: ChannelLimits) -> None:
 
 
 def _turned(recording: Recording) -> tuple[Values | None, Values | None] | None:
-    """Return the angle turned in each block by gyroscope and gravity: (96,) arrays, deg.
-
-    None for a turn about another axis than the stated one.
-    """
+    """Return the angle turned in each block by gyroscope and gravity, (96,), deg; None if an axis not stated turns."""
     axis, gyro = axis_index(recording), None
     if recording.gyroscope is not None and recording.valid.any():
         spread = np.std(recording.gyroscope[recording.valid], axis=0)

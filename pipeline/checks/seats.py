@@ -235,9 +235,9 @@ def seat_notes(turns: Sequence[TurnRecording], table: Table, sensor: Sensor) -> 
 
 
 def refined_zeros(turns: Sequence[TurnRecording]) -> dict[str, float]:
-    """Return the zero of each turn, deg, by all turns together; empty where one seat does not explain them.
+    """Return the zero of each turn, deg, by all turns: one alone leaves it uncertain by the misalignment of the axes.
 
-    The zero by one turn alone is uncertain by the misalignment of the axes.
+    Empty where one seat does not explain the turns.
     """
     every, slow = _conventional([(t, t.found) for t in turns])
     found = _find_seats(slow) if {c.axis for c in slow} == set(range(3)) else None

@@ -34,11 +34,9 @@ components.
     A(t) = P(tau),   r(t) = P'(tau),   tau = m_j + (1 + k) (t - t_j) + d_j       near move j
 
 with the commanded angle P, deg, at the program's time tau. The middle m_j of move j is at the sensor's time t_j by
-offset and drift of the whole program (``pipeline.ingest.clock_alignment``); d_j is the deviation of the move from that,
-s. The drift k during moves is separate, because pauses between moves would bias it.
-
-``d_j`` and ``k`` are fitted to the readings w = a P'(tau) + b of the gyroscope near the move, so that pauses between
-moves may have any length. Lost steps of the motors are not observable; they are part of the table's accuracy.
+offset and drift of the whole program, as above; d_j, s, is the deviation of the move from that. ``d_j`` and ``k`` are
+fitted to the readings w = a P'(tau) + b of the gyroscope near the move, so that pauses between moves may have any
+length. Lost steps of the motors are not observable; they are part of the table's accuracy.
 """
 
 from __future__ import annotations
@@ -51,7 +49,7 @@ import numpy as np
 from imu_logs.log import Log, Note
 from imu_logs.units import ATTITUDE, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError
-from pipeline.core.records import Index, Mask, Values, continuous, level_in_body, rotation_deg
+from pipeline.core.records import Index, Mask, Values, continuous, level_in_body, quintic_spline, rotation_deg
 from pipeline.core.settings import ProgramRest, ProgramTurn, Repeated
 
 ENCODER_STEP_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
@@ -120,10 +118,7 @@ def own_rows(table: Log) -> Log:
 
 
 def unwrapped(table: Log) -> Log:
-    """Make the table's angle continuous where the encoder restarts at 0 or 360 deg.
-
-    A table turns by less than half a turn between two samples, so that a larger step is a restart of the encoder.
-    """
+    """Continue the table's angle where the encoder restarts at 0 or 360 deg: a step of more than half a turn."""
     angle = table.values.get("table_angle")
     if angle is None or len(angle) < 2:
         return table
@@ -179,9 +174,7 @@ def interpolators(log: Log) -> dict[str, Callable[[Values], Values]]:
         cubic = CubicHermiteSpline(log_time, angle, slope)
         out["table_angle"] = lambda tau: cubic(np.clip(tau, log_time[0], log_time[-1]))
     if ATTITUDE[0] in values:
-        from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by attitude logs alone)
-
-        spline = make_interp_spline(log_time, continuous(np.column_stack([values[c] for c in ATTITUDE])), k=5)
+        spline = quintic_spline(log_time, continuous(np.column_stack([values[c] for c in ATTITUDE])))
         for index, channel in enumerate(ATTITUDE):
             out[channel] = lambda tau, i=index: _unit(spline(np.clip(tau, 0.0, log_time[-1])))[:, i]  # type: ignore[misc]
     return out
@@ -192,10 +185,7 @@ def _unit(q: Values) -> Values:
 
 
 def _bent_line(log_time: Values, value: Values, tau: Values) -> Values:
-    """Interpolate linearly, with a bend within an interval where the lines of its two neighbours meet in it.
-
-    At a bend the slope changes by far more than elsewhere.
-    """
+    """Interpolate linearly, with a bend where the lines of both neighbours meet in an interval and differ clearly."""
     tau = np.clip(tau, log_time[0], log_time[-1])
     plain: Values = np.interp(tau, log_time, value)
     slope = np.diff(value) / np.diff(log_time)
@@ -245,15 +235,14 @@ class SensorSignals:
         return SensorSignals(self.time[rows], self.readings[rows], self.rates, self.noise)
 
 
-def fit_clocks(sensor: Log, log: Log) -> ClockFit:
-    """Return offset and drift of the table's clock; the times count from the first sample of each log.
+def fit_clocks(sensor: Log, log: Log, signals: Signals) -> ClockFit:
+    """Return offset and drift of the clock of a table's ``log``; the times count from the first sample of each log.
 
     Raises ``IngestError`` for a sensor without gyroscope, and for logs that do not show the same motion, or that fit
     equally well at several offsets.
     """
     if "gyro_x" not in sensor.values:
         raise IngestError("a table's log with its own clock needs a gyroscope to be aligned", log.path, code="no_sync")
-    signals = signals_of(log)
     sensed = _sensor_signals(sensor, signals)
     look = sensed.part(slice(None, None, max(1, len(sensed.time) // SAMPLES_OF_A_LOOK)))
     places = _places(look, signals)
@@ -311,10 +300,7 @@ def _places(sensed: SensorSignals, signals: Signals) -> list[float]:
 
 
 def _left(sensed: SensorSignals, signals: Signals, offset: float, *, beyond: bool) -> float:
-    """Return the mean squared residual of the whole model at an offset, relative to the noise.
-
-    It is infinite where the logs overlap by less than half of the shorter one.
-    """
+    """Return the mean squared residual over the noise; infinite if the logs share less than half of the shorter."""
     inside = signals.covers(sensed.time + offset)
     shared = float(np.mean(inside)) * sensed.time[-1]
     if shared < MIN_SHARED_DURATION * min(sensed.time[-1], signals.duration):
@@ -410,11 +396,12 @@ def align(sensor: Log, log: Log) -> Log:
     if len(log_time) < MIN_SPLINE_ROWS:
         message = f"the table's log has {len(log_time)} rows; at least {MIN_SPLINE_ROWS} are needed"
         raise IngestError(message, log.path, code="no_sync")
-    if signals_of(log).resting:
+    signals = signals_of(log)
+    if signals.resting:
         tau = np.clip(t, 0.0, log_time[-1])
         note = Note("N-SYNC", len(t), 0, 0, "the table rests throughout its log: there is no motion to align by")
         return _merged(sensor, log, slice(0, len(t)), tau, {}, [note])
-    fit = fit_clocks(sensor, log)
+    fit = fit_clocks(sensor, log, signals)
     tau = fit.table_time(t)
     inside = np.flatnonzero((tau >= 0) & (tau <= log_time[-1]))
     if inside.size < 2:
@@ -440,7 +427,6 @@ def _notes(sensor: Log, rows: slice, fit: ClockFit, offset_s: float) -> list[Not
 
 
 def _one_digit(value: float) -> str:
-    """Format a number with one significant digit, without exponent."""
     return np.format_float_positional(float(f"{value:.1g}"), trim="-")
 
 
@@ -460,8 +446,9 @@ def follow_program(table: Log, program: Sequence[ProgramRest | ProgramTurn | Rep
     commanded = Program([pause, *_flat(program), pause])
     times = np.arange(0.0, commanded.duration, PROGRAM_STEP_S)
     angle, rate, *_ = commanded.at(times)
-    log = {"table_angle": angle, "table_rate": rate}
-    fit = fit_clocks(table, Log(table.path, np.rint(times * 1e9).astype(np.int64), log, table.source))
+    values = {"table_angle": angle, "table_rate": rate}
+    log = Log(table.path, np.rint(times * 1e9).astype(np.int64), values, table.source)
+    fit = fit_clocks(table, log, signals_of(log))
     t = seconds_of(table)
     tau, shifts, drift, begun = _place(table, commanded, t, fit.table_time(t))
     angle, rate, *_ = commanded.at(tau)
@@ -479,16 +466,13 @@ def follow_program(table: Log, program: Sequence[ProgramRest | ProgramTurn | Rep
 
 
 class Program:
-    """Commanded motion of one axis of a table: rests, and turns with a trapezoidal rate.
+    """Commanded motion of one axis of a table: rests, and turns with a trapezoidal rate; at rest before and after.
 
         A(t) = A_k + W_k s + a_k s^2 / 2,   dA/dt = W_k + a_k s,   s = t - t_k
 
     A turn by the angle D at the rate r with acceleration a ramps for r/a, holds r and ramps down; where |D| < r^2/a it
-    does not reach r, and the ramps meet in the middle. The table rests before and after the program.
-
-    ``knots``: (1 + 4 n, 4) array of time t_k
-    (s), angle A_k (deg), rate W_k (deg/s) and acceleration a_k (deg/s^2), four rows for each of n moves. ``stops``:
-    (n + 1,) array of the angles before each move and after the last, deg. ``duration``: in s.
+    does not reach r, and the ramps meet in the middle. ``knots``: (1 + 4 n, 4), t_k (s), A_k (deg), W_k (deg/s) and a_k
+    (deg/s^2), four rows for each of n moves. ``stops``: (n + 1,), deg, before each move and after the last.
     """
 
     def __init__(self, steps: Iterable[ProgramRest | ProgramTurn]) -> None:
@@ -572,5 +556,4 @@ def _about_the_moves(table: Log, commanded: Values) -> Values:
     fitted = np.linalg.lstsq(columns, rates, rcond=None)[0]
     axis = int(np.argmax(np.abs(fitted[0])))
     scale, bias = fitted[:, axis]
-    about: Values = (rates[:, axis] - bias) / scale
-    return about
+    return np.asarray((rates[:, axis] - bias) / scale)

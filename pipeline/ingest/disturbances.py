@@ -40,6 +40,7 @@ from pipeline.core.records import (
     Recording,
     Values,
     continuous,
+    ends_of_runs,
     level_in_body,
     median,
     noise_of_steps,
@@ -71,11 +72,9 @@ LARGEST_SHARE = 0.1  # of the pieces
 def leave_out_disturbances(recording: Recording, note: Callable[[str, Index, str], Note], most: float) -> Recording:
     """Remove the disturbed samples of a recording, and note them by ``note``, the method of its ``Log``.
 
-    If they are more than ``most`` of the samples, none is removed, and that is noted: then the disturbance is
-    a property of the bench.
+    Of more than the share ``most``, a property of the bench, none is removed, and that is noted.
     """
-    silent = recording.accelerometer is None and recording.gyroscope is None
-    if silent or most == 0 or recording.samples < 4 * FEWEST_AROUND:
+    if not recording.readings or most == 0 or recording.samples < 4 * FEWEST_AROUND:
         return recording
     excess, where = disturbed(recording)
     excess[~recording.valid] = 0.0  # no fit looks at them
@@ -94,7 +93,7 @@ def leave_out_disturbances(recording: Recording, note: Callable[[str, Index, str
             f"ingest.checks.disturbed_rows leaves out, so all are kept; does the bench vibrate, "
             f"or the log run on another clock? {worst}"
         )
-        return replace(recording, notes=(*recording.notes, note("N-RESTLESS", rows, detail)))
+        return recording.noted(note("N-RESTLESS", rows, detail))
     detail = f"{places} left out as glitches or knocks; {worst}"
     return without_rows(recording, rows, note("N-DISTURBED", rows, detail))
 
@@ -105,8 +104,7 @@ def without_rows(recording: Recording, rows: Index, note: Note) -> Recording:
     undisturbed[rows] = False
     flags = np.zeros(recording.samples, np.uint16) if recording.flags is None else recording.flags.copy()
     flags[np.minimum(rows + 1, recording.samples - 1)] |= GAP
-    kept = replace(recording, flags=flags).select(undisturbed)
-    return replace(kept, notes=(*kept.notes, note))
+    return replace(recording, flags=flags).select(undisturbed).noted(note)
 
 
 def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
@@ -114,9 +112,9 @@ def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
 
     Samples next to an event of several samples are given the smallest positive excess, so that they are removed, too.
     """
-    found = [(s, r) for s in SENSOR_UNITS if (r := recording.reading(s)) is not None]
-    where = [(s, axis) for s, _ in found for axis in "xyz"]
-    raw = np.concatenate([r for _, r in found], axis=1)
+    found = recording.readings
+    where = [(s, axis) for s in found for axis in "xyz"]
+    raw = np.concatenate([*found.values()], axis=1)
     excess = np.zeros_like(raw)
     if not np.isfinite(raw).all():
         return excess, where
@@ -124,7 +122,7 @@ def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
     if not any((s > JUMP * _noise(s)).any() for s in step.T[:, :, None]):  # mostly the first column of a move
         return excess, where
     motion = _Motion(recording)
-    values = np.concatenate([motion.unexplained(s, r) for s, r in found], axis=1)
+    values = np.concatenate([motion.unexplained(s, r) for s, r in found.items()], axis=1)
     step = np.abs(values[1:] - values[:-1])
     noise = _noise(step)
     jump = step - JUMP * noise
@@ -162,7 +160,7 @@ def _scatter(values: Values) -> float:
 
 def _widened(excess: Values) -> Values:
     rows = np.flatnonzero(np.any(excess > 0, axis=1))
-    for event in [] if not rows.size else np.split(rows, np.flatnonzero(np.diff(rows) > SAME_EVENT) + 1):
+    for event in np.split(rows, np.flatnonzero(np.diff(rows) > SAME_EVENT) + 1):
         if len(event) > 2:
             inside = slice(max(event[0] - 2, 0), event[-1] + 3)
             excess[inside] = np.maximum(excess[inside], np.finfo(float).tiny)
@@ -267,7 +265,7 @@ def leave_out_shaken_rests(recording: Recording, note: Callable[[str, Index, str
     pieces = _pieces(recording)
     if len(pieces) < FEWEST_PIECES:
         return recording
-    found = {s: r for s in SENSOR_UNITS if (r := recording.reading(s)) is not None and np.isfinite(r).all()}
+    found = {s: r for s, r in recording.readings.items() if np.isfinite(r).all()}
     if not found:
         return recording
     excess, scatter = _excess(np.concatenate([*found.values()], axis=1), pieces[:, :2])
@@ -297,9 +295,7 @@ def _pieces(recording: Recording) -> Index:
         return none
     size = max(MIN_PIECE_SAMPLES, round(PIECE_S / recording.interval))
     settling = int(np.ceil(SETTLING_S / recording.interval))
-    padded = np.zeros(len(still) + 2, bool)
-    padded[1:-1] = still
-    rests = np.flatnonzero(padded[1:] != padded[:-1]).reshape(-1, 2)
+    rests = np.stack(ends_of_runs(still), axis=1)
     rests = rests[rests[:, 1] - rests[:, 0] >= MIN_PIECE_SAMPLES + 2 * settling]
     length = rests[:, 1] - rests[:, 0] - 2 * settling
     parts = -(-length // size)
@@ -312,10 +308,7 @@ def _pieces(recording: Recording) -> Index:
 
 
 def _excess(readings: Values, pieces: Index) -> tuple[Values, Values]:
-    """Return the excess of each piece's chi^2 over its limit, and its scatter relative to the usual: (p, s) arrays.
-
-    ``readings``: (n, 3 s), of s sensors.
-    """
+    """Return the excess of each piece's chi^2, and its scatter over the usual, of s sensors: (n, 3 s) to (p, s)."""
     count = np.diff(pieces, axis=1).astype(float)
     bounds = pieces.ravel()
     centred = np.append(readings - readings.mean(axis=0), np.zeros((1, readings.shape[1])), axis=0)

@@ -39,11 +39,9 @@ def recording_files(procedure: Procedure, ingest: Ingest, folder: Path) -> dict[
     """
     found = {}
     for name, candidates in candidate_files(procedure, ingest).items():
-        for candidate in candidates:
-            files = [folder / file for file in candidate if os.path.exists(f"{folder}/{file}")]  # noqa: PTH110  (fast)
-            if files:
-                found[name] = files
-                break
+        existing = ([folder / f for f in c if os.path.exists(f"{folder}/{f}")] for c in candidates)  # noqa: PTH110  (fast)
+        if files := next(filter(None, existing), None):
+            found[name] = files
     return found
 
 

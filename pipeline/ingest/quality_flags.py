@@ -33,7 +33,7 @@ from imu_logs.log import Log
 from imu_logs.profile import Checks
 from imu_logs.units import ATTITUDE, DEGREES, FORCE_UNITS, TABLE_CHANNELS, TRIADS
 from pipeline.core.errors import IngestError
-from pipeline.core.records import SENSOR_UNITS, Index, Integers, Mask, Note, Recording, Values, median
+from pipeline.core.records import SENSOR_UNITS, Index, Integers, Mask, Note, Recording, Values, ends_of_runs, median
 from pipeline.core.settings import Sensor
 
 GAP, CLIPPED, STUCK = np.uint16(1), np.uint16(2), np.uint16(4)  # bits of ``Recording.flags``
@@ -124,8 +124,6 @@ def flag_clipped(table: Log, sensor: str, full_scale: float, flags: NDArray[np.u
     """Flag readings at full scale, g or deg/s; refuse those far beyond it."""
     notes = []
     for channel in TRIADS[sensor]:
-        if channel not in table.values:
-            continue
         values = table.values[channel]
         count = table.count_sizes.get(channel, 0.0)
         largest = max(float(values.max()), -float(values.min()))
@@ -159,15 +157,14 @@ def flag_flat_tops(table: Log, sensor: str, flags: NDArray[np.uint16]) -> list[N
 
     The range of such a sensor or logger is smaller than is stated. k repetitions are expected ``n p^k`` times by
     chance, with p as for stuck readings, of the other values. A value that a sensor may read at rest is no such end.
-    Logs with the motion of a table are not searched: a table may keep its largest rate, and its log contradicts a
+    Logs with a table's motion are not searched: a table may keep its largest rate, and its log contradicts a
     clipped reading.
     """
     notes: list[Note] = []
     if set(TABLE_CHANNELS) & table.values.keys():
         return notes
     for channel in TRIADS[sensor]:
-        if (values := table.values.get(channel)) is None:
-            continue
+        values = table.values[channel]
         steps, ends = np.abs(np.diff(values)), (values.min(), values.max())
         same = steps == 0.0
         if ends[1] - ends[0] < FEWEST_STEPS * np.min(steps, where=~same, initial=np.inf):
@@ -189,10 +186,9 @@ def flag_flat_tops(table: Log, sensor: str, flags: NDArray[np.uint16]) -> list[N
 def find_stuck(table: Log, sensor: str, flags: NDArray[np.uint16]) -> dict[str, Index]:
     """Return the rows, by channel, of readings that are constant for longer than the noise of the channel allows.
 
-    Raises ``IngestError`` for an axis that is constant in half of the rows or more, while the other axes of its sensor
-    change.
+    ``IngestError``: an axis is constant in half of the rows or more, while the other axes of its sensor change.
     """
-    neighbours = {c: v[1:] == v[:-1] for c in TRIADS[sensor] if (v := table.values.get(c)) is not None}
+    neighbours = {c: table.values[c][1:] == table.values[c][:-1] for c in TRIADS[sensor]}
     found = {}
     for channel, same in neighbours.items():
         if not _in_a_row(same, SHORTEST_RUN - 1):
@@ -280,8 +276,7 @@ def _stuck_rows(same: Mask, share: float) -> Index:
     longest = max(SHORTEST_RUN, int(np.ceil(np.log(EXPECTED_CHANCE_RUNS / len(same)) / np.log(p))) + 1)
     if not _in_a_row(same, longest - 1):
         return np.zeros(0, np.intp)
-    edges = np.flatnonzero(np.diff(same, prepend=False, append=False))
-    starts, stops = edges[::2], edges[1::2]
+    starts, stops = ends_of_runs(same)
     long = stops - starts + 1 >= longest
     return np.concatenate([np.arange(a, b + 1) for a, b in zip(starts[long], stops[long], strict=True)])
 
@@ -295,10 +290,7 @@ def _in_a_row(same: Mask, count: int) -> bool:
 
 
 def examine(table: Log, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[np.uint16] | None, list[Note]]:
-    """Return quality flags (None if none is set) and notes; raise ``IngestError`` for impossible values.
-
-    ``sensor``: with the full scales; None if they are not known.
-    """
+    """Return quality flags (None if none is set) and notes; raise ``IngestError`` for impossible values."""
     for channels in (*TRIADS.values(), ATTITUDE):
         missing = [c for c in channels if c not in table.values]
         if 0 < len(missing) < len(channels):
@@ -312,7 +304,7 @@ def examine(table: Log, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[
     flags = np.zeros(len(table.time_ns), np.uint16) if table.flags is None else table.flags.copy()
     notes = flag_gaps(table, flags, checks)
     stuck: dict[str, Index] = {}
-    for name in TRIADS:
+    for name in (s for s, triad in TRIADS.items() if triad[0] in table.values):
         if sensor is not None:
             notes += flag_clipped(table, name, sensor.of(name).full_scale, flags)
         notes += flag_flat_tops(table, name, flags)
@@ -329,12 +321,9 @@ def _check_rate(table: Log, checks: Checks) -> None:
     ratio = interval_us * checks.rate_hz / 1e6
     if abs(ratio - 1.0) <= RATE_TOLERANCE:
         return
-    unit = ""
-    for factor, times in _OTHER_FACTORS.items():
-        if abs(ratio * factor - 1.0) <= RATE_TOLERANCE:
-            unit = f"; the numbers look like {times}"
-    message = f"the median interval is {interval_us:g} us,"
-    message += f" and ingest.checks.rate_hz of {checks.rate_hz:g} Hz expects {1e6 / checks.rate_hz:g} us{unit}"
+    looks = [times for factor, times in _OTHER_FACTORS.items() if abs(ratio * factor - 1.0) <= RATE_TOLERANCE]
+    message = f"the median interval is {interval_us:g} us, and ingest.checks.rate_hz of {checks.rate_hz:g} Hz expects"
+    message += f" {1e6 / checks.rate_hz:g} us{f'; the numbers look like {looks[0]}' if looks else ''}"
     hint = "correct ingest.csv.columns.time.unit or ingest.checks.rate_hz"
     raise IngestError(message, table.path, code="wrong_rate", hint=hint)
 
@@ -440,8 +429,7 @@ def rests_of(force: Values, interval_s: float) -> list[tuple[int, int]]:
     noise = BLOCK_NOISE * float(np.sqrt(2.0 * np.quantile(scatter, 0.1) / width))
     slow = np.linalg.norm(np.diff(means, axis=0), axis=1) <= max(np.radians(LARGEST_STEP_DEG) * size, noise)
     still &= np.append(slow, False) | np.append(False, slow)
-    edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=0, append=0))
-    found = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
+    found = [(int(a), int(b)) for a, b in zip(*ends_of_runs(still), strict=True) if b - a >= 2]
     drift = max(np.radians(LARGEST_DRIFT_DEG) * size, noise)
     return [(a * width, b * width) for a, b in found if np.linalg.norm(means[a:b] - means[a], axis=1).max() <= drift]
 

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import csv
 import glob
-import itertools
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +29,7 @@ import imu_logs
 from imu_logs.files import is_message_log
 from imu_logs.log import Log
 from imu_logs.profile import TIME, Checks, CsvFormat, checks_of, csv_formats
-from imu_logs.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
+from imu_logs.units import ATTITUDE, SCALARS, SINCE_1970_NS, TABLE_CHANNELS, TABLE_TIME, TRIADS
 from pipeline.core.errors import IngestError, InputError, MissingInputError, shortened
 from pipeline.core.records import (
     BETWEEN_ATTITUDES_S,
@@ -49,7 +49,7 @@ from pipeline.core.records import (
     rate_of_attitude,
 )
 from pipeline.core.settings import Ingest, Procedure, RecordingFile, Sensor
-from pipeline.ingest.clock_alignment import unwrapped
+from pipeline.ingest.clock_alignment import align, follow_program, own_rows, unwrapped
 from pipeline.ingest.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.ingest.files import candidate_files
 from pipeline.ingest.quality_flags import examine, without_gaps
@@ -92,12 +92,17 @@ def read_recordings(
         if files != wanted:
             missing += [f"{name} ({file})" for file in wanted if file not in files]
             continue
+        timeless = entry.kind == "attitudes"  # its rows have times of their own, which miss nothing
         try:
             if name in in_memory:
                 table = imu_logs.read_canonical(f"{name} {IN_MEMORY}", in_memory[name], ingest)
             else:
-                table = _table_of(entry, [folder / f for f in files], ingest, layouts, sensor)
-            timeless = entry.kind == "attitudes"  # its rows have times of their own, which miss nothing
+                paths = [folder / f for f in files]
+                table = (
+                    read_attitudes(paths[0], layouts or (), sensor, checks)
+                    if timeless
+                    else read_table(paths, ingest, layouts, entry.session)
+                )
             allowed = checks.model_copy(update={"missing_time": 1.0}) if timeless else checks
             recording = to_recording(name, entry, table, sensor, allowed)
             recording = without_gaps(recording) if timeless else recording
@@ -106,7 +111,7 @@ def read_recordings(
             continue
         if unread:
             detail = f"{', '.join(unread)} exists too and was not read"
-            recording = replace(recording, notes=(*recording.notes, Note("N-NOTREAD", len(unread), 0, 0, detail)))
+            recording = recording.noted(Note("N-NOTREAD", len(unread), 0, 0, detail))
         recordings.append(recording)
     if missing:
         reason = "" if found else _in_its_place(folder)
@@ -115,8 +120,7 @@ def read_recordings(
     if refused:
         raise _together(refused)
     if left_out and recordings:
-        note = Note("N-NOTREAD", len(left_out), 0, 0, "; ".join(left_out))
-        recordings[0] = replace(recordings[0], notes=(*recordings[0].notes, note))
+        recordings[0] = recordings[0].noted(Note("N-NOTREAD", len(left_out), 0, 0, "; ".join(left_out)))
     _check_different(recordings)
     return _compare_clocks(recordings)
 
@@ -141,20 +145,9 @@ def read_table(
     table = imu_logs.read(paths, ingest, session=session, layouts=layouts)
     if not table.apart and TABLE_TIME not in table.values:
         return table
-    from pipeline.ingest.clock_alignment import align, own_rows  # noqa: PLC0415  (only where it is needed)
-
     for log in table.apart or (own_rows(table),):
         table = align(table, log)
     return replace(table, apart=())
-
-
-def _table_of(
-    entry: RecordingFile, paths: Sequence[Path], ingest: Ingest, layouts: Sequence[CsvFormat] | None, sensor: Sensor
-) -> Log:
-    if entry.kind != "attitudes":
-        return read_table(paths, ingest, layouts, entry.session)
-
-    return read_attitudes(paths[0], layouts or (), sensor, checks_of(ingest))
 
 
 def _existing(candidates: Sequence[Sequence[str]], folder: Path) -> tuple[list[str], list[str], list[str]]:
@@ -204,19 +197,12 @@ def of_one_sensor(procedure: Procedure, files: Collection[str]) -> str:
     return f"; of a unit without {lacking[0]}, set method.{lacking[0]}=null" if len(lacking) == 1 and others else ""
 
 
-def _copy(values: Mapping[str, Values], channel: str) -> Values | None:
-    """Return a copy of a channel, which does not keep the other columns of its file in memory; None without it."""
-    return values[channel].copy() if channel in values else None
-
-
 def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | None, checks: Checks) -> Recording:
     """Convert a table of channels to a recording in body axes, with quality flags; removes the channels from ``table``.
 
     ``entry``: of the procedure, with the ``program`` of a table without a log. ``sensor``: None if it is not known.
     """
     if entry.program and not set(TABLE_CHANNELS) & table.values.keys():
-        from pipeline.ingest.clock_alignment import follow_program  # noqa: PLC0415  (few tables need it)
-
         table = follow_program(table, entry.program)
     table = unwrapped(table)
     flags, notes = examine(table, sensor, checks)
@@ -233,14 +219,16 @@ def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | N
     if left_handed:  # not a rotation: some sensors have left-handed axes, so that the map is used
         detail = ", ".join(f"[{', '.join(maps[s])}] of the {s}" for s in left_handed)
         notes.insert(0, Note("N-LEFTHANDED", len(left_handed), 0, 0, f"left-handed axis map: {detail}"))
-    readings: dict[str, Values | None] = dict.fromkeys(TRIADS)
+    channels: dict[str, Any] = {}
     for which, triad in TRIADS.items():
         stacked = _stack(values, triad)
         if stacked is not None:
-            readings[which] = in_body_axes(maps[which], stacked)
+            channels[which] = in_body_axes(maps[which], stacked)
             continue
         detail = f"the file has no column that the profile assigns to the {which}: it cannot calibrate this sensor"
         notes.append(Note("N-ABSENT", len(table.time_ns), 0, 0, detail))
+    # copies, which do not keep the other columns of the file in memory
+    channels |= {channel: values[channel].copy() for channel in SCALARS if channel in values}
     recording = Recording(
         name=name,
         role=entry.role,
@@ -248,15 +236,11 @@ def to_recording(name: str, entry: RecordingFile, table: Log, sensor: Sensor | N
         setup=entry.setup or "",
         kind=entry.kind or "",
         time_ns=table.time_ns,
-        accelerometer=readings["accelerometer"],
-        gyroscope=readings["gyroscope"],
-        temperature=_copy(values, "temperature"),
-        table_angle=_copy(values, "table_angle"),
-        table_rate=_copy(values, "table_rate"),
         table_attitude=_stack(values, ATTITUDE),
         flags=flags,
         source=table.source,
         notes=(*table.notes, *notes),
+        **channels,
     )
     if recording.axis is None and recording.table_attitude is not None and recording.table_rate is None:
         rate = rate_of_attitude(recording.time * recording.table_seconds, recording.table_attitude)
@@ -295,10 +279,10 @@ def _compare_clocks(recordings: list[Recording]) -> list[Recording]:
         first = "the unit's first sample" if all_of_unit else "the first sample since 1970 (other files: another clock)"
         detail = f"times count from {first}, {origin} ns in the clock of the files"
         note = Note("N-EPOCH", len(since_1970), 0, 0, detail)
-        moved = {r.name: replace(r, time_ns=r.time_ns - origin, notes=(*r.notes, note)) for r in since_1970}
+        moved = {r.name: replace(r.noted(note), time_ns=r.time_ns - origin) for r in since_1970}
         recordings = [moved.get(r.name, r) for r in recordings]
     spans = sorted((int(r.time_ns[0]), int(r.time_ns[-1])) for r in recordings)
-    overlap = any(start <= end for (_, end), (start, _) in itertools.pairwise(spans))
+    overlap = any(start <= end for (_, end), (start, _) in pairwise(spans))
     apart = overlap or 0 < len(since_1970) < len(recordings)
     return [replace(r, clock_shared=False) for r in recordings] if apart else recordings
 

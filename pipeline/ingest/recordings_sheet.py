@@ -49,8 +49,7 @@ HINT = "docs/recordings.md shows a sheet for each case"
 def with_sheet(settings: Settings, folder: Path) -> Settings:
     """Return the settings of a unit with the recordings of its sheet, if its procedure reads one.
 
-    ``folder``: of the unit's recordings. A sheet that cannot be used leaves no recordings: ``require_recordings`` then
-    states the reason where the recordings are read, so that other units go on.
+    A sheet that cannot be used leaves no recordings, so that other units go on; ``require_recordings`` says why.
     """
     procedure = settings.procedure
     if procedure.sheet is None:

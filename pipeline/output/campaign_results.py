@@ -77,8 +77,7 @@ class CampaignResults:
     @property
     def units(self) -> list[str]:
         """Names of the units, in the order of ``units.csv``."""
-        names: list[str] = self.summary["unit"].tolist()
-        return names
+        return list(self.summary["unit"])
 
     @cached_property
     def summary(self) -> pd.DataFrame:

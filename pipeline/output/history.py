@@ -227,10 +227,9 @@ def _changed_values(before: JSON, after: JSON) -> list[str]:
     values = ((state.get(VALUES) or {}).items() for state in (before, after))
     old, new = ({f"{s}.{k}": v for s, part in each for k, v in part.items()} for each in values)
     keys = [k for k in dict.fromkeys([*old, *new]) if old.get(k) != new.get(k)] if old and new else []
-    keys = [k for k in keys if not k.startswith("effects.")]
-    defined = [k for k in keys if k.startswith("user_effects.") and not (k in old and k in new)]  # effects, too
-    arrow = "\N{RIGHTWARDS ARROW}"
-    return [f"{k}: {old.get(k, 'absent')} {arrow} {new.get(k, 'absent')}" for k in keys if k not in defined]
+    defined = {k for k in old.keys() ^ new.keys() if k.startswith("user_effects.")}  # effects, too
+    keys = [k for k in keys if not k.startswith("effects.") and k not in defined]
+    return [f"{k}: {old.get(k, 'absent')} \N{RIGHTWARDS ARROW} {new.get(k, 'absent')}" for k in keys]
 
 
 def dropped(entries: Sequence[JSON]) -> dict[tuple[str, int], list[str]]:

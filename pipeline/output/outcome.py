@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from imu_logs.units import SENSORS
+from imu_logs.units import SENSOR_UNITS, SENSORS
 from pipeline.core.errors import shortened
 from pipeline.core.files import INSTALLED, JSON, read_json, text_of_cell
 from pipeline.core.verdicts import (
@@ -37,7 +37,6 @@ from pipeline.output.history import difference, dropped, errors_of, of_units, re
 
 Ways = Sequence[Sequence[str]]
 
-SENSOR_UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 ZERO_SETTING = re.compile(r"(?<=zero_deg=)-?[0-9.]+")
 ALIKE_DEG = 0.1  # gravity shows a zero to some hundredths of a degree (docs/mounting.md, What is checked)
 NAMED_PER_LINE = 5  # units that a line names, and lines of one kind
@@ -146,45 +145,41 @@ def lines_of(groups: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     return [f"{what}: {', '.join(shortened(units, NAMED_PER_LINE))}" for what, units in groups]
 
 
-def commands_of(
-    part: Mapping[str, Any], sensor: str, unit: str, settings: Mapping[str, Any], results: str = DEFAULT_RESULTS
-) -> JSON:
+def commands_of(part: Mapping[str, Any], sensor: str, unit: str, settings: Mapping[str, Any]) -> JSON:
     """Return the commands that add the effects which a diagnosis selected; ``{}`` if it selected none.
 
     ``add`` is for every run, ``once`` for one run. ``verb`` is "add", or "try" if the effects do not explain the whole
-    residual. ``part``: the sensor's part of ``diagnoses/<unit>.json``; ``settings``: of the run; ``results``: folder of
-    the results of all campaigns.
+    residual. ``part``: the sensor's part of ``diagnoses/<unit>.json``.
     """
     if not part.get("override"):
         return {}
     effects = [f"{sensor}.{name}" for name in part["selected"]]
     verb = "add" if part["verdict"] == Verdict.MISSING_EFFECT else "try"
-    them, once = "it" if len(effects) == 1 else "them", once_command(settings, unit, [part["override"]], results)
-    return {"verb": f"{verb} {them}", "add": add_command(settings, unit, effects, results), "once": once}
+    them, once = "it" if len(effects) == 1 else "them", once_command(settings, unit, [part["override"]])
+    return {"verb": f"{verb} {them}", "add": add_command(settings, unit, effects), "once": once}
 
 
-def command_of(problem: Problem, settings: Mapping[str, Any], results: str = DEFAULT_RESULTS) -> str:
+def command_of(problem: Problem, settings: Mapping[str, Any]) -> str:
     """Return the command with which the user can continue: it adds, runs again, or shows the evidence."""
     units, overrides = problem.units, SETTING.findall(problem.step)
     if problem.kind == Verdict.MISSING_EFFECT:
         if len(units) == 1:
-            return add_command(settings, units[0], problem.effects, results)
+            return add_command(settings, units[0], problem.effects)
         names = {effect.partition(".")[2] for effect in problem.effects}
-        return _command("add", settings, ["--missing", *(names if len(names) == 1 else ())], results)
-    again = dict(settings) | ({"results": results} if results != DEFAULT_RESULTS else {})
+        return _command("add", settings, ["--missing", *(names if len(names) == 1 else ())])
     if problem.kind == FAILED:
-        return run_command(again)
+        return run_command(settings)
     if overrides and len(units) <= NAMED_PER_LINE:
         given = settings.get("unit_overrides") or {}
         of_units = {unit: [*given.get(unit, []), *overrides] for unit in sorted(units)}
-        return run_command(again | {"unit_overrides": {**given, **of_units}})
-    return explain_command(settings, [units[0]], results)
+        return run_command({**settings, "unit_overrides": {**given, **of_units}})
+    return explain_command(settings, [units[0]])
 
 
-def explain_command(settings: Mapping[str, Any], words: Sequence[str], results: str = DEFAULT_RESULTS) -> str:
+def explain_command(settings: Mapping[str, Any], words: Sequence[str]) -> str:
     """Return the command that shows the evidence for some units, or with ``--all`` for every unit."""
     campaign = str(settings.get("campaign", "demo")).rstrip("/")
-    return _command("explain", {"campaign": campaign}, words, results)
+    return _command("explain", {"campaign": campaign, "results": settings.get("results")}, words)
 
 
 def problem_words(problem: Problem, most: int = NAMED_PER_LINE) -> str:
@@ -206,10 +201,9 @@ def ratio_words(problem: Problem) -> str:
 def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) -> str:
     """Return the closing lines of a run, except those about failed units.
 
-    ``results``: folder of the campaign's results; ``settings``: of the run; ``of_this_run``: whether this run wrote the
-    last entry of the history.
+    ``of_this_run``: whether this run wrote the last entry of the history of the ``results``.
     """
-    rows, folder = read_summary(results), str(results.parent)
+    rows, settings = read_summary(results), {**settings, "results": str(results.parent)}
     lines = _reasons(results, [row["unit"] for row in rows])
     lines += lines_of(beyond_limits_groups(rows))
     lines += lines_of(_not_in_uncertainty(rows).items())
@@ -221,30 +215,30 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
         lines += shortened(_changes(entries), NAMED_PER_LINE, "sensors that changed")
         no_longer = [
             f"{unit}: this run no longer has {', '.join(effects)}, which run {run} had; to have it in every run:\n"
-            f"  {add_command(settings, unit, effects, folder)}"
+            f"  {add_command(settings, unit, effects)}"
             for (unit, run), effects in dropped(entries).items()
         ]
         lines += shortened(no_longer, NAMED_PER_LINE, "units that no longer have an effect")
     found = problems(rows, once=True)
     for problem in reversed(found):  # the most urgent next to the end
         if problem.kind not in (FAILED, Verdict.MISSING_EFFECT):
-            lines += [problem_words(problem), f"  {command_of(problem, settings, folder)}"]
-    lines += [*_missing(found, settings, folder), *filter(None, [all_well(rows)])]
+            lines += [problem_words(problem), f"  {command_of(problem, settings)}"]
+    lines += [*_missing(found, settings), *filter(None, [all_well(rows)])]
     return "\n".join([*lines, f"{counted(rows)}; look at {results}/index.html"]) + "\n"
 
 
-def _missing(found: Sequence[Problem], settings: Mapping[str, Any], results: str) -> list[str]:
+def _missing(found: Sequence[Problem], settings: Mapping[str, Any]) -> list[str]:
     """Return the lines before the last: each unit with a missing effect, or how many there are and what lists them."""
     missing = [problem for problem in found if problem.kind == Verdict.MISSING_EFFECT]
     units = {unit for problem in missing for unit in problem.units}
     if len(units) > NAMED_MISSING:
         return [
-            f"effect missing: {len(units)} units; to list them:", f"  {explain_command(settings, ['--all'], results)}",
-            "to add to each unit its missing effects:", f"  {_command('add', settings, ['--missing'], results)}",
+            f"effect missing: {len(units)} units; to list them:", f"  {explain_command(settings, ['--all'])}",
+            "to add to each unit its missing effects:", f"  {_command('add', settings, ['--missing'])}",
         ]  # fmt: skip
     lines = [problem_words(problem, NAMED_MISSING) for problem in missing]
-    commands = [command_of(missing[0], settings, results)] if len(missing) == 1 else []
-    commands = commands or [_command("add", settings, ["--missing"], results)] * bool(missing)
+    commands = [command_of(missing[0], settings)] if len(missing) == 1 else []
+    commands = commands or [_command("add", settings, ["--missing"])] * bool(missing)
     return lines + [f"  {command}" for command in commands]
 
 
@@ -313,10 +307,7 @@ def changes_of(results: Path, units: Sequence[str]) -> list[str]:
 
 
 def uncertainty_words(before: JSON, after: JSON, unit: str) -> str:
-    """Return the change of the expanded uncertainties of bias and matrix in words; empty without a change.
-
-    ``before``, ``after``: states of a sensor in the history.
-    """
+    """Return in words how U of bias and matrix changed between two states of a sensor; empty without a change."""
     was, now = (state.get("uncertainty") or {} for state in (before, after))
     changes = [
         f"{key} {was[key] * scale:.2g} -> {now[key] * scale:.2g} {of}"
@@ -327,12 +318,9 @@ def uncertainty_words(before: JSON, after: JSON, unit: str) -> str:
 
 
 def run_command(settings: Mapping[str, Any]) -> str:
-    """Return the command of a run: ``snakemake`` where its rules are, else ``run`` of this package.
-
-    ``settings``: those of ``--config``: ``campaign``, ``overrides``, ``unit_overrides``, ``results`` ...
-    """
+    """Return the command of a run with settings of ``--config``: ``snakemake`` where its rules are, else ``run``."""
     if not Path("Snakefile").is_file():
-        return _command("run", settings, [], str(settings.get("results") or DEFAULT_RESULTS))
+        return _command("run", settings, [])
     return shlex.join(["snakemake", "--cores", "2", *_config(settings)])
 
 
@@ -343,7 +331,7 @@ def apply_command(settings: Mapping[str, Any], unit: str) -> str:
     return shlex.join([*_program(), "apply", "--calibration", file, "LOG.csv", "-o", "LOG_calibrated.csv"])
 
 
-def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], results: str = DEFAULT_RESULTS) -> str:
+def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str]) -> str:
     """Return the command that adds effects (``sensor.effect``) to the file of a unit and runs the campaign.
 
     It also adds the effects that ``unit_overrides`` sets for this run, because that override has precedence. Where
@@ -358,11 +346,11 @@ def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], 
     for sensor, _, name in (effect.partition(".") for effect in effects):
         wanted[sensor] = [*dict.fromkeys([*wanted.get(sensor, ()), name])]
     if stronger:
-        return once_command(settings, unit, [f"effects.{s}=[{','.join(wanted[s])}]" for s in sorted(sensors)], results)
+        return once_command(settings, unit, [f"effects.{s}=[{','.join(wanted[s])}]" for s in sorted(sensors)])
     others = [override for override in own if not EFFECTS_OVERRIDE.fullmatch(override)]
     of_units |= {unit: others} if others else {}
     named = [f"{sensor}.{name}" for sensor, names in wanted.items() for name in names]
-    return _command("add", {**settings, "unit_overrides": of_units}, [unit, *named], results)
+    return _command("add", {**settings, "unit_overrides": of_units}, [unit, *named])
 
 
 def _effects_of(overrides: Iterable[str]) -> dict[str, list[str]]:
@@ -371,18 +359,15 @@ def _effects_of(overrides: Iterable[str]) -> dict[str, list[str]]:
     return {m[1]: [name.strip() for name in (m[2] or "").split(",") if name.strip()] for m in found}
 
 
-def once_command(
-    settings: Mapping[str, Any], unit: str, overrides: Sequence[str], results: str = DEFAULT_RESULTS
-) -> str:
+def once_command(settings: Mapping[str, Any], unit: str, overrides: Sequence[str]) -> str:
     """Return the command that runs the campaign once with further overrides of a unit."""
     of_units, keys = settings.get("unit_overrides") or {}, {override.partition("=")[0] for override in overrides}
     others = [text for text in of_units.get(unit, []) if text.partition("=")[0] not in keys]
-    once = {**settings, "unit_overrides": {**of_units, unit: [*others, *overrides]}}
-    return run_command(once | ({"results": results} if results != DEFAULT_RESULTS else {}))
+    return run_command({**settings, "unit_overrides": {**of_units, unit: [*others, *overrides]}})
 
 
-def _command(command: str, settings: Mapping[str, Any], words: Sequence[str], results: str) -> str:
-    """Return a command of this package for the campaign of a run."""
+def _command(command: str, settings: Mapping[str, Any], words: Sequence[str]) -> str:
+    results = str(settings.get("results") or DEFAULT_RESULTS)
     folder = ["--results", results] if results != DEFAULT_RESULTS else []
     rest = {key: value for key, value in settings.items() if key not in ("campaign", "results")}
     return shlex.join([*_program(), command, str(settings.get("campaign", "demo")), *words, *folder, *_config(rest)])
@@ -393,7 +378,10 @@ def _program() -> list[str]:
 
 
 def _config(settings: Mapping[str, Any]) -> list[str]:
-    pairs = [f"{key}={_flow(value, top=True)}" for key, value in settings.items() if value not in UNSET]
+    results = settings.get("results")
+    stated = {k: v for k, v in settings.items() if v not in UNSET and k != "results"}
+    stated |= {"results": results} if results and results != DEFAULT_RESULTS else {}
+    pairs = [f"{key}={_flow(value, top=True)}" for key, value in stated.items()]
     return ["--config", *pairs] if pairs else []
 
 

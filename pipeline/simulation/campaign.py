@@ -3,17 +3,11 @@
 Every stream of random numbers has a separate generator, ``default_rng([seed, unit, stream])``, so that a change in one
 (say, lost samples) does not change the others.
 
-The table's log is in the sensor's rows, in a file with a separate clock, or only the commanded program is known.
+The table's log is in the sensor's rows, or in a file with the interval and the clock of the table's computer,
 
-    tau = t + d + k t
+    tau = t + d + k t,    t, tau : the sensor's and the table's clock, s,    d, k : offset and drift, s and 1
 
-where
-
-t, tau : the sensor's and the table's clock, s
-d, k   : offset and drift of the table's clock, s and 1
-
-A file has the sampling interval of the table's computer. For a table without encoders the program is written as a
-separate procedure.
+For a table without encoders its program is written instead, as a separate procedure.
 
     <directory>/units.csv, campaign.yaml, simulation.yaml
     <directory>/raw/<unit>/<recording>.csv (or .mcap)
@@ -67,7 +61,7 @@ from pipeline.simulation.sensor import (
     drawn_effects,
     drawn_sensors,
 )
-from pipeline.simulation.trajectory import CommandedTurns, Gimbals, Planned, RestsAndMoves, random_errors, rotation_by
+from pipeline.simulation.trajectory import CommandedTurns, Gimbals, Planned, random_errors, rotation_by
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
 ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3  # of CSV files: rounding far below any noise
@@ -122,8 +116,7 @@ class Environment:
             phase = phase + np.clip((time - start) / (end - start), 0.0, 1.0)
         triangle = 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * phase))
         warm = self.warm_up * (1.0 - np.exp(-time / self.warm_up_time))
-        total: Values = self.ambient + warm + self.drift * room + self.ramp * triangle
-        return total
+        return np.asarray(self.ambient + warm + self.drift * room + self.ramp * triangle)
 
     def reading(self, time: Values, rng: np.random.Generator) -> Values:
         """Return the thermometer's reading: (n,) array, degC."""
@@ -159,8 +152,8 @@ def record(
 ) -> list[Recording]:
     """Simulate the recordings of a unit with its sampling interval and share of lost samples.
 
-    ``benches``: role to bench, ``""`` for all other roles; ``effects``: sensor to its effects, of which effects of
-    mounting, table and timing change the motion; ``pause``: s, between the recordings and before the first.
+    ``benches``: by role, ``""`` for all others; ``effects``: by sensor, those of mounting, table and timing change the
+    motion; ``pause``: s, between the recordings and before the first.
     """
     times = _times(planned, unit.interval_s, pause)
     seconds = [t / SECOND_NS for t in times]
@@ -225,7 +218,6 @@ def _scene(plan: Planned, bench: SimulatedBench, start: float, rng: np.random.Ge
 
 
 def _log(plan: Planned, bench: SimulatedBench, time: Values) -> dict[str, Any]:
-    """Return the table's log of the commanded motion."""
     trajectory = plan.trajectory
     if bench.table.motion == "none":
         return {}
@@ -238,7 +230,6 @@ def _log(plan: Planned, bench: SimulatedBench, time: Values) -> dict[str, Any]:
         rate = np.linalg.norm(trajectory.pose(time).omega, axis=1)
         attitude = np.round(trajectory.quaternion(time), QUATERNION_DECIMALS)
         return {"table_attitude": attitude, "table_rate": np.round(rate, ANGLE_DECIMALS)}
-    assert isinstance(trajectory, RestsAndMoves)  # noqa: S101
     return {"table_rate": np.zeros(len(time))} if plan.role == "static" else {}
 
 
@@ -342,10 +333,7 @@ def columns_of(unit: UnitDescription) -> dict[str, str]:
 
 
 def programs_of(units: Sequence[UnitDescription]) -> dict[str, str]:
-    """Return the procedures of tables without a log, each with its program: name to YAML.
-
-    Raises ``ConfigurationError`` if units of one procedure have different programs.
-    """
+    """Return the procedures of tables without a log, name to YAML; refuse units of one with different programs."""
     found: dict[str, str] = {}
     for unit in units:
         if unit.log.kind == BY_PROGRAM:
@@ -374,8 +362,7 @@ def write_campaign(
 ) -> None:
     """Simulate every unit of a description and write the campaign; files of the same names are replaced.
 
-    ``progress`` is called with a line for each finished unit. ``sheet_only``: write ``units.csv`` without recordings
-    and truth, for a campaign whose run simulates them.
+    ``progress`` gets a line for each unit. ``sheet_only``: no recordings and truth, which the campaign's run makes.
     """
     for name, text in programs_of(description.units).items():
         path = directory / "configs" / "procedure" / f"{name}.yaml"
@@ -425,10 +412,9 @@ def _sheet_rows(description: Description) -> list[dict[str, Any]]:
 def simulate_unit(
     unit: UnitDescription, seed: int, number: int, extra: Sequence[Planned] = ()
 ) -> tuple[list[Recording], dict[str, Any]]:
-    """Return the recordings of one unit and its true parameters.
+    """Return the recordings of one unit, those of ``extra`` after those of its procedure, and its true parameters.
 
-    The seed and the unit's number in its campaign determine every random number. ``extra``: recordings to make after
-    those of the procedure.
+    The seed and the unit's number in its campaign determine every random number.
     """
     streams, course = Streams(seed, number), course_of(unit)
     benches, effects = _drawn(unit, streams)

@@ -142,8 +142,7 @@ class Course(Described):
 def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy: float = 0.0) -> list[Planned]:
     """Return the recordings of a procedure, in the order in which they are made.
 
-    Without a table, attitudes are set with the standard deviation ``hand_accuracy``, deg. Raises ``ConfigurationError``
-    if there is no such procedure.
+    ``hand_accuracy``: of attitudes without a table, standard deviation, deg. ``ConfigurationError``: no such procedure.
     """
     if procedure in TABLE_PROCEDURES:
         planned = _turns(course)
@@ -152,21 +151,18 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
             planned.append(Planned("validation", "validation", None, motion))
         planned += _static(course)
         return _with_transits(planned, course) if procedure == ONE_RECORDING else planned
-    attitudes: dict[str, Callable[[], Values]] = {
-        "orientations_24": orientations_24,
-        "six_positions": six_positions,
-        "multi_position": lambda: random_attitudes(course.positions, rng),
-    }
-    if procedure not in {*attitudes, FERRARIS, OF_A_SHEET}:
-        known = ", ".join((*TABLE_PROCEDURES, *attitudes, FERRARIS, OF_A_SHEET))
-        raise ConfigurationError(f"no procedure is called {procedure!r}; known: {known}")
     if procedure == OF_A_SHEET:
         return _listed(course, rng, hand_accuracy)
-    if procedure == FERRARIS:
-        moves = _faces_and_turns(course, rng, hand_accuracy)
-    else:
-        moves = _rests(attitudes[procedure](), course, rng, hand_accuracy)
-    planned = [Planned("recording", "rests", None, moves)]
+    moves: dict[str, Callable[[], RestsAndMoves]] = {
+        "orientations_24": lambda: _rests(orientations_24(), course, rng, hand_accuracy),
+        "six_positions": lambda: _rests(six_positions(), course, rng, hand_accuracy),
+        "multi_position": lambda: _rests(random_attitudes(course.positions, rng), course, rng, hand_accuracy),
+        FERRARIS: lambda: _faces_and_turns(course, rng, hand_accuracy),
+    }
+    if procedure not in moves:
+        known = ", ".join((*TABLE_PROCEDURES, *moves, OF_A_SHEET))
+        raise ConfigurationError(f"no procedure is called {procedure!r}; known: {known}")
+    planned = [Planned("recording", "rests", None, moves[procedure]())]
     if course.validation_s > 0.0:
         count = max(2, int(course.validation_s / (course.dwell_s + 2.0)))
         held_out = _rests(random_attitudes(count, rng), replace(course, warm_up_rest_s=0.0), rng, 0.0)
@@ -419,10 +415,7 @@ class Description(Described):
 
 
 def read_description(path: Path) -> Description:
-    """Read a ``simulation.yaml``.
-
-    Raises ``MissingInputError`` if there is none, ``ConfigurationError`` if a key is unknown.
-    """
+    """Read a ``simulation.yaml``; ``MissingInputError``: there is none; ``ConfigurationError``: it is wrong."""
     return description_from(_read_mapping(path), str(path))
 
 
@@ -497,10 +490,7 @@ def _units_of_entry(entry: UnitDescription) -> list[UnitDescription]:
 
 
 def add_recording_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for the bench and the procedure to a parser with ``argument_default=argparse.SUPPRESS``.
-
-    ``simulate`` and ``plan`` share them: a planned procedure can be simulated with the same options.
-    """
+    """Add the options for bench and procedure of ``simulate`` and ``plan`` to a parser whose default is SUPPRESS."""
     add = parser.add_argument
     add("--sensor", metavar="NAME", help="configs/sensor (mpu6050)")
     add("--table", metavar="NAME", help="configs/table (acutronic; hand for procedures without a table)")

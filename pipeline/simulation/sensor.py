@@ -200,8 +200,7 @@ class SimulatedSensor:
         """Round the reading to whole counts and clip it at full scale: (n, 3) array, g or deg/s."""
         counts = np.round(reading * self.data_sheet.counts_per_unit)
         top = self.data_sheet.full_scale * self.data_sheet.counts_per_unit
-        kept: Values = np.clip(counts, -top, top - 1.0) / self.data_sheet.counts_per_unit
-        return kept
+        return np.asarray(np.clip(counts, -top, top - 1.0) / self.data_sheet.counts_per_unit)
 
 
 def decimals_of(data_sheet: DataSheet) -> int:
@@ -233,10 +232,7 @@ def drawn_sensors(
     effects: Mapping[str, Hidden],
     rng: np.random.Generator,
 ) -> dict[str, SimulatedSensor]:
-    """Return accelerometer and gyroscope of a unit, from the configuration and the description of each.
-
-    Raises ``ConfigurationError`` if a key of the description is unknown.
-    """
+    """Return both sensors of a unit by configuration and description; ``ConfigurationError``: an unknown key."""
     mounting = rng.uniform(-1.0, 1.0, 3)
     out = {}
     for sensor in SENSORS:
@@ -264,8 +260,7 @@ def _matrix(data_sheet: DataSheet, given: Mapping[str, Any], mounting: Values, r
     lower[[1, 2, 2], [0, 0, 1]] = np.radians(np.array(given.get("non_orthogonality_deg", skew), float))
     angles = np.array(given.get("mounting_deg", mounting), float)
     x, y, z = (rotation_about(axis, np.array([a]))[0] for axis, a in zip(np.eye(3), angles, strict=True))
-    matrix: Values = (z @ y @ x).T @ lower @ np.diag(scale)
-    return matrix
+    return np.asarray((z @ y @ x).T @ lower @ np.diag(scale))
 
 
 def _limited(limit: float, rng: np.random.Generator) -> Values:

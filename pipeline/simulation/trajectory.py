@@ -115,8 +115,7 @@ class TurnErrors:
         """Return the true turn axis: (3,) unit vector, body frame."""
         u = np.zeros(3)
         u[[axis, (axis + 1) % 3, (axis + 2) % 3]] = 1.0, *self.direction
-        unit: Values = u / np.linalg.norm(u)
-        return unit
+        return np.asarray(u / np.linalg.norm(u))
 
     def force(self, program: Program, time: Values) -> Values | None:
         """Return the specific force of the plate's vibration: (n, 3) array, g, or None without vibration."""
@@ -124,8 +123,7 @@ class TurnErrors:
             return None
         phase = 2.0 * np.pi * (self.vibration_frequency * time[:, None] + np.arange(3) / 3.0)
         moving = program.at(time)[1] != 0.0
-        shaken: Values = self.shaking * moving[:, None] * np.sin(phase)
-        return shaken
+        return np.asarray(self.shaking * moving[:, None] * np.sin(phase))
 
     def motion(self, program: Program, time: Values) -> tuple[Values, Values, Values]:
         """Return the true angle (deg), rate (deg/s) and acceleration (deg/s^2): (n,) arrays."""
@@ -273,8 +271,7 @@ class Gimbals:
 class Eased(Gimbals):
     """Motion of a table that begins and ends at rest: the motion of ``Gimbals`` at the time s(t).
 
-    At the start, ``s(t) = T u^4 (5/2 - 3 u + u^2)``, ``u = t / T``, with ``T = COMES_UP_S``; at the end, the same
-    backwards.
+    At the start, ``s(t) = T u^4 (5/2 - 3 u + u^2)``, ``u = t / T``, with ``T = COMES_UP_S``; at the end likewise.
     """
 
     def angles(self, time: Values) -> tuple[Values, ...]:
@@ -323,8 +320,7 @@ def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator) 
     """Draw a random motion whose |angular rate| has the maximum ``peak_rate`` (deg/s).
 
     The inner gimbal turns steadily and the middle one swings by 42 deg rms. Then the mean squares of the three
-    components of the vertical are equal: the attitudes cover the sphere evenly. The speed is scaled to the maximum
-    rate.
+    components of the vertical are equal: the attitudes cover the sphere evenly.
     """
     frequency = np.exp(rng.uniform(0.0, np.log(3.0), (3, SINUSOIDS))) / PERIOD_S
     weight = rng.uniform(0.5, 1.0, (3, SINUSOIDS))

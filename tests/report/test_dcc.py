@@ -130,14 +130,14 @@ def faults(element: ET.Element) -> list[str]:
 
 
 def test_the_structure_is_that_of_the_schema(report: dict[str, Any]) -> None:
-    root = ET.fromstring((digital_certificate("U1", report) or "").encode())  # noqa: S314  (our own)
+    root = ET.fromstring((digital_certificate(report) or "").encode())  # noqa: S314  (our own)
     assert faults(root) == []
     assert root.get("schemaVersion") == "3.2.1"
     assert {tag(e) for e in root.iter()} > {"si:expandedUnc", "si:realListXMLList", "metaData", "manufacturer", "role"}
 
 
 def test_values_are_those_of_the_report_in_units_of_the_si(report: dict[str, Any]) -> None:
-    root = ET.fromstring((digital_certificate("U1", report) or "").encode())  # noqa: S314  (our own)
+    root = ET.fromstring((digital_certificate(report) or "").encode())  # noqa: S314  (our own)
     results = dict(zip(("accelerometer", "gyroscope"), root.iter(f"{DCC}measurementResult"), strict=True))
     for r in report["measurementResults"]:
         factor = 9.80665 if r["name"] == "accelerometer" else 1.0
@@ -159,7 +159,7 @@ def test_values_are_those_of_the_report_in_units_of_the_si(report: dict[str, Any
 
 
 def test_what_users_wrote_is_text_and_not_markup(report: dict[str, Any]) -> None:
-    text = digital_certificate("U1", report) or ""
+    text = digital_certificate(report) or ""
     assert "IMU &lt;&amp;&gt; board" in text
     assert "<dcc:uniqueIdentifier>S1-7</dcc:uniqueIdentifier>" in text
 
@@ -169,7 +169,7 @@ def test_nothing_is_invented_for_a_report_that_lacks_what_the_schema_demands(rep
     without["administrativeData"]["coreData"]["countryCodeISO3166_1"] = None
     assert missing_for_dcc(report) == []
     assert missing_for_dcc(without) == ["certificate.country"]
-    assert digital_certificate("U1", without) is None
+    assert digital_certificate(without) is None
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_a_unit_that_d_si_does_not_know_is_not_guessed() -> None:
 def test_html_json_and_xml_state_the_same_items_of_the_standard(unit: Unit) -> None:
     """ISO/IEC 17025:2017, 7.8.2.1, 7.8.2.2, 7.8.4.1 and 7.8.4.3."""
     report = report_of(unit, {"next_date": "2027-02-03", "adjusted": None})
-    xml, page = digital_certificate("U1", report), certificate_page("U1", report)
+    xml, page = digital_certificate(report), certificate_page("U1", report)
     assert xml is not None
     kinds = [json.dumps(report, ensure_ascii=False), xml, html.unescape(page)]
     (ratio,) = re.findall(r"error of the \w+ ([\d.]+) × noise", report["measurementResults"][0]["model"]["sentence"])

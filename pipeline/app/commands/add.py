@@ -31,7 +31,7 @@ from pipeline.core.pack import read_published
 from pipeline.core.records import SENSOR_UNITS, SENSORS
 from pipeline.core.verdicts import Verdict
 from pipeline.output.exports import ExportedUnit
-from pipeline.output.outcome import DEFAULT_RESULTS, NAMED_PER_LINE, changes_of, read_summary, run_command
+from pipeline.output.outcome import NAMED_PER_LINE, changes_of, read_summary, run_command
 from pipeline.physics.effects import catalogue
 
 OVERRIDES_KEY = "overrides"
@@ -304,9 +304,7 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
         _apply(edit)
     if not undo and (note := _bench_note(chain.from_iterable(effects_of.values()))):
         print(note)
-    settings = {"campaign": arguments.campaign, **run_settings}
-    if arguments.results != DEFAULT_RESULTS:
-        settings["results"] = arguments.results
+    settings = {"campaign": arguments.campaign, **run_settings, "results": arguments.results}
     command = run_command(settings).replace("--cores 2", f"--cores {arguments.cores}", 1)
     if arguments.no_run:
         print(f"then: {command}")

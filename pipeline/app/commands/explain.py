@@ -150,9 +150,9 @@ def overview(folder: Path, rows: Sequence[Mapping[str, Any]], width: int, *, who
     for i, problem in enumerate(found):
         shown = problem_words(problem, len(problem.units)) if whole else _short(problem)
         step = [] if problem.kind == Verdict.MISSING_EFFECT else [f"  {problem.step}"]
-        block = [*_wrapped([shown, *step], width), f"  {command_of(problem, settings, str(folder.parent))}"]
+        block = [*_wrapped([shown, *step], width), f"  {command_of(problem, settings)}"]
         if not whole and len(lines) + len(block) > MOST_ROWS - 2:
-            everything = explain_command(settings, ["--all"], str(folder.parent))
+            everything = explain_command(settings, ["--all"])
             return "\n".join([*lines, f"{len(found) - i} more kinds of problems; to list all:", f"  {everything}", ""])
         lines += block
     return "\n".join([*lines, ""])
@@ -166,9 +166,10 @@ def _short(problem: Problem) -> str:
 
 
 def _settings(folder: Path) -> JSON:
-    """Return the settings of the last run."""
+    """Return the settings of the last run, and its folder of results."""
     entries = read_history(folder)
-    return (entries[-1].get("settings") if entries else None) or {"campaign": folder.name}
+    stated = (entries[-1].get("settings") if entries else None) or {"campaign": folder.name}
+    return {**stated, "results": str(folder.parent)}
 
 
 def _wrapped(lines: Sequence[str], width: int) -> list[str]:
@@ -208,7 +209,7 @@ def explain(
 
     ``limits``: with the upper limits of effects that were not selected.
     """
-    settings, results = _settings(folder), str(folder.parent)
+    settings = _settings(folder)
     units: list[JSON] = []
     for unit, document in diagnoses.items():
         validation, calibration = (_json(folder / of / f"{unit}.json") or {} for of in ("validations", "calibrations"))
@@ -223,7 +224,7 @@ def explain(
             "validation": validation,
             "errors": {s: error_of(validation.get(s)) for s in SENSORS},
             "verdicts": {s: (document.get(s) or {}).get("verdict") for s in SENSORS},
-            "commands": {s: commands_of(document.get(s) or {}, s, name, settings, results) for s in SENSORS},
+            "commands": {s: commands_of(document.get(s) or {}, s, name, settings) for s in SENSORS},
             "notes": [*_notes(calibration), *(f"Left out: {line}." for line in left_out(calibration.get("inputs")))],
             "board": explain_board(calibration),
             "moves": moves_over_noise(validation),

@@ -37,7 +37,7 @@ def report(
     words = {sensor: in_words(diagnosis[sensor], sensor, most_values=3) for sensor in SENSORS}
     page = render(calibration, validation, diagnosis, filtered, settings, words=words, incomplete=omissions)
     document = certificate(calibration, validation, settings, sensor_temperature(filtered), diagnosis)
-    kinds = {"json": document, "html": certificate_page(unit, document), "xml": digital_certificate(unit, document)}
+    kinds = {"json": document, "html": certificate_page(unit, document), "xml": digital_certificate(document)}
     return {f"{unit}.html": page} | {f"certificates/{unit}.{kind}": made for kind, made in kinds.items() if made}
 
 

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.interpolate import BSpline
 
-    from imu_logs.log import Integers, Mask, Note, Values
+    from imu_logs.log import Index, Integers, Mask, Note, Values
     from pipeline.core.settings import Sensor
 
 ReturnedQuantity = TypeVar("ReturnedQuantity")
@@ -177,6 +177,15 @@ class Recording:
     def reading(self, sensor: str) -> Values | None:
         """Return the (n, 3) readings of ``accelerometer`` (g) or ``gyroscope`` (deg/s), or None."""
         return self.accelerometer if sensor == "accelerometer" else self.gyroscope
+
+    @property
+    def readings(self) -> dict[str, Values]:
+        """The (n, 3) readings of each sensor that the recording has, g and deg/s."""
+        return {sensor: values for sensor in TRIADS if (values := self.reading(sensor)) is not None}
+
+    def noted(self, *notes: Note) -> Self:
+        """Return the recording with further notes."""
+        return replace(self, notes=(*self.notes, *notes))
 
     def select(self, index: NDArray[Any] | slice) -> Self:
         """Return the recording with only the samples of ``index`` (slice, mask or integers)."""
@@ -398,6 +407,14 @@ def motion_at_rest(time: NDArray[np.float64]) -> Motion:
     zeros = np.zeros((len(time), 3))
     still = np.ones(len(time), bool)
     return Motion(time, zeros, zeros, zeros, zeros, None, None, None, None, still)
+
+
+def ends_of_runs(mask: Mask) -> tuple[Index, Index]:
+    """Return where the runs of True in a mask start and stop."""
+    padded = np.zeros(len(mask) + 2, bool)
+    padded[1:-1] = mask
+    edges = np.flatnonzero(padded[1:] != padded[:-1])
+    return edges[::2], edges[1::2]
 
 
 def finite_rows(values: Values) -> Mask:

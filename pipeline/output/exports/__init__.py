@@ -7,7 +7,7 @@ and how ``convert`` reads it), and the text of the file in Jinja2. The text has 
     sensors                    the calibrated sensors, by name
     remarks                    convention, omitted quantities, the remaining error, the held-out errors
     unit, document             name of the unit, its calibration
-    sheets, gravity_g          figures of each sensor (``sensors.SensorFigures``); local gravity, g
+    gravity_g                  local gravity, g
     noise                      ``sensors.noise``, of a format with ``noise: true``
 
 the functions of ``sensors.TEMPLATE_FUNCTIONS``, and the filters ``comment``, ``json``, ``yaml``, ``numbers``. The name
@@ -70,7 +70,7 @@ class Format:
     consumer: str  # program that reads the file
     equation: str  # by which the consumer corrects a reading
     source: str  # documentation of the equation
-    file: str  # name of the file, with {unit} for the name of the unit; default: name of the template
+    file: str = ""  # name of the file, with {unit} for the name of the unit; default: name of the template
     units: dict[str, Literal["g", "m/s^2", "deg/s", "rad/s"]]  # of readings; the format has only sensors with a unit
     sensor_endings: dict[str, str] = field(default_factory=dict)  # of file names, if each sensor has a separate file
     required: list[str] = field(default_factory=list)  # sensors that must be calibrated; "board": the reference chip
@@ -105,10 +105,7 @@ def _environment() -> Templates:
 
 def text_of(name: str, **values: Any) -> str:  # noqa: ANN401
     """Render a template that is not a format."""
-    return _template(name).render(values)
-
-
-_template = cache(lambda name: _environment().get_template(name))
+    return _environment().get_template(name).render(values)
 
 
 @cache
@@ -117,9 +114,9 @@ def formats() -> dict[str, tuple[Format, Template]]:
 
     Raises ``ConfigurationError`` for a missing or unknown key of a declaration, an unknown unit, or one file of two.
     """
-    keys = [key for key in dataclass_fields(Format) if key.name != "file"]
+    keys = dataclass_fields(Format)
     required = [key.name for key in keys if key.default is MISSING and key.default_factory is MISSING]
-    checks: dict[str, Check] = {key.name: lambda value: value for key in dataclass_fields(Format)}
+    checks: dict[str, Check] = {key.name: lambda value: value for key in keys}
     check = fields(checks | {"units": each(one_of(*UNIT_FACTORS))}, required)
     formats_by_name: dict[str, tuple[Format, Template]] = {}
     environment = _environment().overlay(loader=_Texts(TEMPLATES))
@@ -201,10 +198,7 @@ class ExportedUnit:
 def exports(
     calibration: JSON, settings: Settings, validation: JSON | None = None, diagnosis: JSON | None = None
 ) -> dict[str, str]:
-    """Return the texts of a calibration in every format, by file name.
-
-    ``calibration, validation, diagnosis``: the published documents of the unit.
-    """
+    """Return the texts of a unit's published documents in every format, by file name."""
     sheets = {s: SensorFigures.of(settings.sensor.of(s)) for s in SENSORS}
     exported = ExportedUnit(calibration, sheets, settings.table.gravity_g, validation, diagnosis)
     return {file: text for format_name in formats() for file, text in export(format_name, exported).items()}
@@ -238,7 +232,7 @@ def _rendered(declared: Format, template: Template, exported: ExportedUnit) -> s
     available = {*sensors, "board"} if (exported.document.get("board") or {}).get("chips") else set(sensors)
     if without_counts or not set(declared.required) <= available:
         return None
-    about = {key: getattr(exported, key) for key in ("document", "sheets", "gravity_g")}
+    about = {key: getattr(exported, key) for key in ("document", "gravity_g")}
     about |= {"noise": noise(exported.noise_figures) if declared.noise else None, "sensors": sensors}
     about |= {"unit": exported.document["unit"], "remarks": _remarks(declared, sensors, exported)}
     return template.render(**{s: sensors.get(s) for s in SENSORS}, **about)
@@ -269,8 +263,7 @@ def _json(content: Any, indent: int = 2) -> str:  # noqa: ANN401
 def _yaml(content: Any) -> str:  # noqa: ANN401
     """Return YAML with keys in their order and short lists on one line, by the faster libyaml if it is available."""
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-    text: str = yaml.dump(as_json(content), Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
-    return text
+    return str(yaml.dump(as_json(content), Dumper=dumper, sort_keys=False, default_flow_style=None, width=120))
 
 
 def _numbers(values: Any, form: str = "%.17g", separator: str = " ") -> str:  # noqa: ANN401

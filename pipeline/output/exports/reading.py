@@ -286,11 +286,10 @@ def _thermal(sensor: str, polynomial: Values, notes: list[str]) -> list[FittedEf
     polynomial = np.where(np.abs(polynomial) > FORMAT_ROUNDING * np.abs(polynomial).max(), polynomial, 0.0)
     if np.any(polynomial[:, 4:]):
         notes.append(f"{sensor}: the bias beyond the third order of the temperature is left out")
-    if np.any(polynomial[:, 3:4]):
-        return [fitted_effect("bias_temperature_cubic", sensor, polynomial[:, 1:4].ravel())]
-    if np.any(polynomial[:, 2:3]):
-        return [fitted_effect("bias_temperature_quadratic", sensor, polynomial[:, 1:3].ravel())]
-    return [fitted_effect("bias_temperature", sensor, polynomial[:, 1])] if np.any(polynomial[:, 1:2]) else []
+    for order, name in ((3, "bias_temperature_cubic"), (2, "bias_temperature_quadratic"), (1, "bias_temperature")):
+        if np.any(polynomial[:, order : order + 1]):
+            return [fitted_effect(name, sensor, polynomial[:, 1 : order + 1].ravel())]
+    return []
 
 
 def document_of(imported: ImportedCalibration) -> JSON:
@@ -345,8 +344,7 @@ def convert(
 ) -> tuple[list[Path], list[str]]:
     """Write a calibration in a format; return the files and the losses, in sentences.
 
-    ``target``: the file; if the format has a file for each sensor, their endings are added to its stem.
-    ``sheets``: figures of each sensor, for counts and noise.
+    ``target``: its stem gets the endings of a format with a file for each sensor. ``sheets``: for counts and noise.
     """
     document = document_of(imported)
     if format_name == CALIBRATION:

@@ -321,12 +321,12 @@ def accelerometer_frame(accelerometer: ExportedSensor | None, gyroscope: Exporte
     The factors are exact: ``K_a = M_a Q``, ``f_i = Q f``, ``K_g Q^T = M_g C``, ``A = G Q^T C^T``, G the g-sensitivity.
     """
     M_a, Q = (np.eye(3), np.eye(3)) if accelerometer is None else lower_times_rotation(accelerometer.K)
-    pose = np.block([[Q, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
+    frame = {"M_a": M_a, "T_i_b": pose(Q, np.zeros(3))}
     if gyroscope is None:
-        return {"M_a": M_a, "T_i_b": pose, "M_g": np.eye(3), "C": np.eye(3), "A": np.zeros((3, 3))}
+        return frame | {"M_g": np.eye(3), "C": np.eye(3), "A": np.zeros((3, 3))}
     M_g, C = lower_times_rotation(gyroscope.K @ Q.T)
     A = gyroscope.g_sensitivity / STANDARD_GRAVITY @ Q.T @ C.T
-    return {"M_a": M_a, "T_i_b": pose, "M_g": M_g, "C": C, "A": A}
+    return frame | {"M_g": M_g, "C": C, "A": A}
 
 
 def pose(rotation: Values, place: Values) -> Values:

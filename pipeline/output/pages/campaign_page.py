@@ -19,7 +19,7 @@ from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Values
 from pipeline.core.verdicts import FAR, KINDS, MARK_ABOVE_FLOORS, RowState, Verdict, far_by_moves, problems, state_of
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.outcome import all_well, beyond_limits_groups, command_of, counts_of, explain_command, ratio_words
-from pipeline.output.pages.chart import Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, sentences
+from pipeline.output.pages.chart import Area, ChartLayer, Dots, Figure, LineMark, Panel, chart, worded
 from pipeline.output.pages.fleet import parameter_table, wide
 from pipeline.output.pages.pages import Scale, number, percent, scale_of, script_data, template, typeset, unit_text
 from pipeline.output.pages.parameters import SUMMARY_COLUMNS
@@ -60,12 +60,11 @@ def render(
 ) -> str:
     """Return ``index.html``.
 
-    ``rows``: of ``summary_row``, one a unit, in the order of ``units.csv``; ``failures``: ``unit, stage, code,
-    message, file`` of each failed unit; ``comparisons``: of ``comparison.section``; ``page``: name of a further page;
-    ``twins``: of ``gather.same_files``; ``statistics``: of ``fleet_statistics``; ``parameters``: of
-    ``parameter_table`` for all units; ``history``: of ``runs_data``; ``settings``: of the run, for the proposed
-    commands; ``published``: units with a page where pages are published on request only, None: all; ``about``: the
-    number of the last run that changed something, its day, and the version of this package.
+    ``rows``: of ``summary_row``, in the order of ``units.csv``; ``failures``: ``unit, stage, code, message, file`` of
+    each; ``comparisons``: of ``comparison.section``; ``page``: name of a further page; ``twins``: of
+    ``gather.same_files``; ``statistics``: of ``fleet_statistics``; ``parameters``: of ``parameter_table``; ``history``:
+    of ``runs_data``; ``settings``: of the run, for the proposed commands; ``published``: units with a page, None: all;
+    ``about``: ``run`` that last changed something, its ``day``, and the ``version`` of this package.
     """
     settings, states = settings or {"campaign": campaign}, [*map(state_of, rows)]
     found = problems(states)
@@ -86,7 +85,7 @@ def render(
     for failure in failures:
         cause = f"{failure.get('code')} in stage {failure.get('stage') or 'unknown'}"
         causes.setdefault(cause, []).append(str(failure.get("unit")))
-    text: str = template("campaign.html").render(
+    return template("campaign.html").render(
         campaign=campaign,
         published=published,
         published_names=None if published is None else script_data(sorted(published)),
@@ -96,7 +95,6 @@ def render(
         implausible=[(r["unit"], s, names) for r in rows for s in SENSORS if (names := r.get(f"{s}_implausible"))],
         left_out=[(r["unit"], what) for r in rows if (what := r.get("left_out"))],
         incomplete=[(r["unit"], what) for r in rows if (what := r.get("incomplete"))],
-        ok=sum(row["status"] == "ok" for row in rows),
         passed=judged.count(True),
         not_passed=judged.count(False),
         judged=any(row.get("pass") is not None for row in rows if row["status"] == "ok"),
@@ -134,7 +132,6 @@ def render(
         kept=sorted(set(frame) - set(SUMMARY_COLUMNS)),
         page=page,
     )
-    return text
 
 
 def judged_on(rows: Sequence[Mapping[str, Any]], sensors: Sequence[str] = SENSORS) -> str:
@@ -323,10 +320,7 @@ def _quantiles(order: np.ndarray, values: np.ndarray, colour: int) -> list[Chart
 
 
 def strips(rows: Sequence[JSON], parameters: pd.DataFrame) -> list[UnitChart]:
-    """Return the strip plots of a campaign, each with the text of its dots.
-
-    ``rows``: of ``summary_row``, one a unit, in the order of the page; ``parameters``: of ``parameter_table``.
-    """
+    """Return the strip plots of a campaign, each with the text of its dots; ``rows``: in the order of the page."""
     siblings: dict[tuple[str, str], list[int]] = {}
     for i, row in enumerate(rows):
         if row["status"] == "ok":
@@ -373,8 +367,10 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
                 for a, b in zip(i, j, strict=True)
             ]
     worst, column = np.unravel_index(np.nanargmax(np.abs(share)), share.shape)
-    finding, caption, description = sentences(
+    texts = worded(
         "strip",
+        name,
+        tuple(legend),
         title=title,
         beyond=int(beyond.any(axis=1).sum()),
         count=len(numbers),
@@ -384,11 +380,10 @@ def _strip(name: str, title: str, units: list[str], numbers: Index, table: pd.Da
         edge=MAX_DRAWN_SHARE if np.nanmax(np.abs(share)) > MAX_DRAWN_SHARE else 0,
         medians=[*zip(labels, np.nanmedian(share, axis=0).tolist(), strict=True)],
     )
-    figure = Figure(name, finding, caption, tuple(legend))
     panel = Panel([*layers, *dots], "", ROW * len(labels), limits=(0.4, height[0] + 0.6), rows=labels[::-1])
     label = "share of the data sheet's limit, %"
     left = max(LEFT, round(NAME_LETTER * max(map(len, labels))) + 10)
-    return chart(figure, description, [panel], label, margin=0.03, left=left, units="units"), values
+    return chart(*texts, [panel], label, margin=0.03, left=left, units="units"), values
 
 
 def _bar(ends: Values, low: float, high: float, colour: int) -> ChartLayer:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from itertools import repeat
+from itertools import product, repeat
 from operator import attrgetter
 from typing import Any
 
@@ -83,11 +83,7 @@ def certificate(
     temperature: str | None,
     diagnosis: JSON | None = None,
 ) -> JSON:
-    """Return the report of one calibrated unit.
-
-    ``settings``: of the unit; ``temperature``:
-    range of the sensor's temperature, degC, None where it was not recorded; ``diagnosis``: of the unit.
-    """
+    """Return the report of a calibrated unit; ``temperature``: range in degC, None where it was not recorded."""
     stated = settings.certificate
     document: JSON = {
         "schema": "imu-calibration/certificate/1",
@@ -244,10 +240,9 @@ def _supplied(calibration: JSON, sensor: str, held_out: JSON) -> str:
 def _relations(part: JSON) -> Iterator[tuple[str, Parameter]]:
     """Yield each entry of the matrix with the element of K, its inverse, that has the same indices."""
     found = {p.name: p for p in reading_errors(part)}
-    for row in AXES:
-        for column in AXES:
-            name = f"scale_factor_error_{row}" if row == column else f"cross_axis_{row}{column}"
-            yield f"matrix_{row}{column}", found[name]
+    for row, column in product(AXES, repeat=2):
+        name = f"scale_factor_error_{row}" if row == column else f"cross_axis_{row}{column}"
+        yield f"matrix_{row}{column}", found[name]
 
 
 def _quantities(part: JSON) -> list[JSON]:
@@ -306,8 +301,7 @@ def certificate_page(unit: str, report: JSON) -> str:
     # A string of a style sheet: all characters but letters and digits are written by their number.
     codes = Markup("".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in sheet))  # noqa: S704
     lacking = missing_for_dcc(report)
-    page: str = template("certificate.html").render(unit=unit, report=report, sheet=codes, lacking=lacking)
-    return page
+    return template("certificate.html").render(unit=unit, report=report, sheet=codes, lacking=lacking)
 
 
 def missing_for_dcc(report: JSON) -> list[str]:
@@ -316,21 +310,19 @@ def missing_for_dcc(report: JSON) -> list[str]:
     return [m["key"] for m in report["missing"]] + [key for key, name in DEMANDED.items() if not core[name]]
 
 
-def digital_certificate(unit: str, report: JSON) -> str | None:
+def digital_certificate(report: JSON) -> str | None:
     """Return ``certificates/<unit>.xml`` of a report of ``certificate``; None where a statement is missing."""
     if missing_for_dcc(report):
         return None
     place = report["administrativeData"]["coreData"]["performanceLocation"]
     results = [{**r, "quantities": [_quantity(q) for q in r["results"]], "tables": _tables(r)}
                for r in report["measurementResults"]]  # fmt: skip
-    text: str = template("dcc.xml").render(
-        unit=unit,
+    return template("dcc.xml").render(
         report=report,
         results=results,
         place=place if place in PLACES else "other",
         filled=lambda value: " ".join(str(value).split()),
     )
-    return text
 
 
 def dsi_unit(unit: str) -> tuple[float, str] | None:

@@ -35,6 +35,7 @@ ANGLE_STEPS = (10.0, 15.0, 30.0, 45.0, 90.0, 180.0, 360.0, 720.0, 1800.0, 3600.0
 LINEAR_TO = 10.0  # value to which a symlog axis is linear: delta BIC of strong evidence
 
 Tick = tuple[float, str]
+Legend = tuple[tuple[str, str], ...]
 Places = dict[tuple[int, int], tuple[Values, Integers]]  # of ``_placed``
 AXES_LEGEND = (("c0", "x"), ("c1", "y"), ("c2", "z"))
 CHART_WIDTH = 420  # px, of the drawing; the page scales it
@@ -194,7 +195,7 @@ class Figure(NamedTuple):
     name: str
     finding: str
     caption: str = ""
-    legend: tuple[tuple[str, str], ...] = ()
+    legend: Legend = ()
     quiet: bool = False
     svg: str = ""
 
@@ -209,12 +210,12 @@ class Figure(NamedTuple):
         return self._replace(svg=svg, finding=finding, caption=typeset(self.caption))
 
 
-def sentences(figure: str, **values: Any) -> tuple[str, str, str]:  # noqa: ANN401
-    """Return the sentences of a chart by its macro in ``templates/figures.txt``: finding, caption, description."""
-    text = str(getattr(template("figures.txt").module, figure)(**values))
+def worded(macro: str, name: str, legend: Legend = (), /, **values: Any) -> tuple[Figure, str]:  # noqa: ANN401
+    """Return a figure with the texts of a macro in ``templates/figures.txt``, and its description."""
+    text = str(getattr(template("figures.txt").module, macro)(**values))
     parts = (part.replace("\n", " ").split(" ") for part in text.split("---\n"))
     finding, caption, *description = (" ".join(filter(None, words)).strip() for words in parts)
-    return finding, caption, " ".join(description)
+    return Figure(name, finding, caption, legend), " ".join(description)
 
 
 class LineMark(NamedTuple):
@@ -295,10 +296,9 @@ def chart(
 ) -> Figure:
     """Return a figure with its chart: panels that share the axis x.
 
-    ``description``: for screen readers; ``x_label``: of the axis x; ``kind``: of the axis x, "", "angle" (deg),
-    "count" or "log"; ``margin``: share of the values' range by which the axis x exceeds it; ``left``: space for the
-    ticks of the axes y, px; ``columns``: names of x = 1, 2, ...; ``units``: list in the script of the page that names
-    the units.
+    ``description``: for screen readers; ``kind``: of the axis x, "", "angle" (deg), "count" or "log"; ``margin``: share
+    of the values' range by which the axis x exceeds it; ``left``: space for the ticks of the axes y, px; ``columns``:
+    names of x = 1, 2, ...; ``units``: list in the script of the page that names the units.
     """
     values = {id(layer.x): layer.x for p in panels for layer in p.layers if layer.x is not None}
     x = Axis.over(values.values(), left, CHART_WIDTH - RIGHT, kind, margin)

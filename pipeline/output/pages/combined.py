@@ -51,6 +51,7 @@ from pipeline.core.records import (
     Values,
     files_of_readings,
     matrix_of,
+    with_arrays,
 )
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.engine import scaled_inverse
@@ -169,8 +170,7 @@ def with_values(calibration: SensorCalibration, theta: Values, lines: Sequence[C
 def repeatability(x: Values, variance: Values, kind: Index) -> Values:
     """Return r, the standard deviation in addition to the stated variances, of (n, p) values: (p,) array.
 
-    ``variance``: (n, p). ``kind``: (p,), 0 ..; parameters of one kind have one r. The sum decreases with r, which
-    is found by bisection.
+    ``variance``: (n, p). ``kind``: (p,), 0 ..; parameters of one kind have one r. The sum decreases with r: bisection.
     """
     n = len(x)
 
@@ -212,8 +212,7 @@ class UnitEstimate(NamedTuple):
     def read(cls, data: JSON) -> UnitEstimate:
         """Return the estimate of an entry of a file; equal texts of all units share their memory."""
         texts = {k: sys.intern(data[k]) for k in ("sensor", "lot", "comparable")}
-        arrays = {k: np.array(data[k]) for k in ("values", "own", "freedom", "shared", "kind", "known")}
-        return cls(**{**data, **texts, **arrays})
+        return cls(**{**with_arrays(data), **texts})
 
 
 class UnitPrior(NamedTuple):
@@ -237,10 +236,7 @@ class UnitPrior(NamedTuple):
 
 
 def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> list[UnitEstimate]:
-    """Return the estimate of each sensor of a calibrated unit for the prior of its lot.
-
-    ``row``: of ``units.csv``; ``calibration``, ``diagnosis``: as published.
-    """
+    """Return the estimate of each sensor of a calibrated unit for the prior of its lot; ``row``: of ``units.csv``."""
     found, lot = [], row.get("lot")
     for sensor in [s for s in SENSORS if calibration[s]]:
         part = calibration[sensor]
@@ -274,8 +270,7 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
 def _divided(fit: SensorCalibration) -> tuple[Values, Values, tuple[Values, Values]]:
     """Return the covariance by the noise of the unit, the one by errors that siblings may share, and both freedoms.
 
-    The degrees of freedom of the readings follow from the effective ones by Welch and Satterthwaite, because the bench
-    has infinitely many.
+    That of the readings follows from the effective one by Welch and Satterthwaite: the bench has infinitely many.
     """
     readings, _ = own_and_bench(fit)
     own, shared = own_and_bench(fit, with_lack_of_fit=True)

@@ -53,8 +53,8 @@ from pipeline.output.pages.parameters import fitted_parameters
 TEST_LEVEL = 0.05  # of a test, and 1 minus the coverage of an interval (JCGM 100:2008, 6.2.2: about 95 %)
 MEASURES = {"after": "rms error, held out", "truth": "rms error against the truth"}
 FIGURE_COLUMNS = (
-    "unit", "sensor", "before", "u_before", "after", "u_after", "truth", "u_truth", "noise_floor", "table_time",
-    "verdict", "parameters",
+    "unit", "sensor", "before", "after", "u_after", "truth", "u_truth", "noise_floor", "table_time", "verdict",
+    "parameters",
 )  # fmt: skip
 
 
@@ -228,9 +228,9 @@ def finding(groups: Mapping[str, pd.DataFrame], pairs: Mapping[str, str] | None)
 def unit_figures(calibration: JSON, validation: JSON, diagnosis: JSON | None) -> list[JSON]:
     """Return the figures of a unit for comparisons, a dict for each calibrated sensor.
 
-    It has ``unit, sensor``; rms errors ``before`` and ``after`` with the standard uncertainty ``u_<name>`` (g or
-    deg/s); ``truth`` (None; see ``against_truth``); ``noise_floor``; ``reference_rms``; ``table_time``, the length of
-    the recordings of the fit (s); ``verdict``; ``parameters``: name to Parameter.
+    It has ``unit, sensor``; rms errors ``before`` and ``after`` and standard uncertainty ``u_after``, g or deg/s;
+    ``noise_floor``; ``reference_rms``; ``table_time``, the length of the recordings of the fit (s); ``verdict``;
+    ``parameters``: name to Parameter. For simulated recordings ``truth`` is added (``against_truth``).
     """
     rows = []
     for sensor in SENSORS:
@@ -242,11 +242,8 @@ def unit_figures(calibration: JSON, validation: JSON, diagnosis: JSON | None) ->
                 "unit": calibration["unit"],
                 "sensor": sensor,
                 "before": error.before,
-                "u_before": _noise_of_error(error.before, error, held_out),
                 "after": error.after,
-                "u_after": _noise_of_error(error.after, error, held_out),
-                "truth": None,
-                "u_truth": None,
+                "u_after": _noise_of_error(error, held_out),
                 "noise_floor": error.floor,
                 "reference_rms": held_out.get("reference_rms"),
                 "table_time": sum(i.get("duration_s") or 0.0 for i in inputs) or None,
@@ -256,9 +253,9 @@ def unit_figures(calibration: JSON, validation: JSON, diagnosis: JSON | None) ->
     return rows
 
 
-def _noise_of_error(rms: float | None, error: Error, held_out: JSON) -> float | None:
+def _noise_of_error(error: Error, held_out: JSON) -> float | None:
     """Return the standard uncertainty of a held-out error by the noise of its samples."""
-    samples = (held_out.get("samples") or 0) * (3 if error.kind == "vector" else 1)
+    rms, samples = error.after, (held_out.get("samples") or 0) * (3 if error.kind == "vector" else 1)
     if not rms or not error.floor or not samples:
         return None
     noise = min(error.floor, rms) ** 2

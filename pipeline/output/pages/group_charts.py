@@ -68,8 +68,7 @@ def bars(
     """Return a figure with a row for each value.
 
     ``label``: of the values, with unit; ``levels``: vertical lines by their text, only levels above 0 are drawn;
-    ``kind``: of the axis, "log", or "symlog" with bars from zero; ``brackets``: each joins rows, by index of the row
-    and the text at its end.
+    ``kind``: of the axis, "log", or "symlog" with bars from zero; ``brackets``: index and text of its rows.
     """
     levels = {words: value for words, value in (levels or {}).items() if value > 0}
     values = [v for r in rows for v in (r.value, *(r.interval or ()), *r.units, r.floor) if v is not None]

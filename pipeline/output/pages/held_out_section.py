@@ -35,7 +35,7 @@ from pipeline.output.pages.chart import (
     Panel,
     SampleMarks,
     chart,
-    sentences,
+    worded,
 )
 from pipeline.output.pages.group_charts import Point, bars
 from pipeline.output.pages.pages import Scale, number, percent
@@ -136,8 +136,7 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, scale: Scale, *, vecto
     last = f"{'' if _exact(found) else 'about '}{number(added[-1].value, added[-1].digits)}" if added else ""
     about = {"kind": kind, "reached": reached, "floor": floor, "unit": unit, "added": last}
     about |= {"held_out": held_out.get("held_out", True), "sources": [SOURCES[held_out["noise"][key]] for key in keys]}
-    finding, caption, _ = sentences("staircase", **about)
-    figure = Figure(f"{sensor}-staircase-{kind}", finding, caption)
+    figure, _ = worded("staircase", f"{sensor}-staircase-{kind}", **about)
     label = f"root mean square error, {unit} (logarithmic)"
     return bars(figure, rows + added, label, levels={f"noise floor {number(floor)}": floor or 0.0})
 
@@ -170,10 +169,7 @@ def _exact(found: JSON) -> bool:
 def held_out_figures(
     sensor: str, fits: Mapping[str, SensorCalibration], held_out: JSON, recordings: list[Recording], table: Table
 ) -> list[Figure]:
-    """Draw the error of the magnitude in each held-out recording with a reference, as in the validation.
-
-    ``fits``: of the calibrated sensors; ``held_out``: the sensor's part of the validation.
-    """
+    """Draw the error of the magnitude in each held-out recording with a reference, as in the validation."""
     floor, by_hand, figures = held_out.get("noise_floor"), table.motion == "none", []
     for recording in (r for r in recordings if r.role == "validation"):
         logged = sensor == "accelerometer" or (recording.table_rate is not None and table.latitude_deg is None)
@@ -211,8 +207,7 @@ def held_out_over_time(
     ]
     rms = [float(np.sqrt(np.nanmean(v**2))) for v in (raw, calibrated)]
     about = {"name": recording.name, "sensor": sensor, "rms": rms, "unit": unit, "by_hand": by_hand}
-    finding, caption, description = sentences("held_out", **about)
-    return chart(Figure(name, finding, caption, BEFORE_AFTER), description, panels, "time, s")
+    return chart(*worded("held_out", name, BEFORE_AFTER, **about), panels, "time, s")
 
 
 def attitude_over_time(found: JSON) -> Figure | None:
@@ -223,8 +218,7 @@ def attitude_over_time(found: JSON) -> Figure | None:
     panels = [_attitude_panel(curve, "drift", "gyroscope alone, deg")]
     if found.get("tilt_rms_deg"):
         panels.append(_attitude_panel(curve, "tilt", "fused tilt, deg"))
-    finding, caption, description = sentences("attitude", found=found)
-    return chart(Figure("attitude-error", finding, caption, BEFORE_AFTER), description, panels, "time, s")
+    return chart(*worded("attitude", "attitude-error", BEFORE_AFTER, found=found), panels, "time, s")
 
 
 def _attitude_panel(curve: JSON, name: str, label: str) -> Panel:
@@ -238,10 +232,7 @@ def _attitude_panel(curve: JSON, name: str, label: str) -> Panel:
 
 
 def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON | None) -> Figure | None:
-    """Draw the Allan deviation of each axis; None where no noise was identified.
-
-    ``noise``: the sensor's part of ``noise`` in its calibration; ``wander``: the bias wander by the diagnosis.
-    """
+    """Draw the Allan deviation of each axis; None where no noise was identified; ``wander``: by the diagnosis."""
     axes = {a: part for a, part in ((noise or {}).get("axes") or {}).items() if part["terms"]}
     if not noise or not axes:
         return None
@@ -261,17 +252,13 @@ def allan(sensor: str, noise: JSON | None, data_sheet: DataSheet, wander: JSON |
     mean = np.mean([part["allan"]["deviation"] for part in axes.values()], axis=0)
     means = [(float(mean[k]), float(tau[k])) for k in (0, len(tau) // 2, -1)]
     about = {**_white(axes, density), "unit": unit, "noise": noise, "wander": wander, "mean": means}
-    finding, caption, description = sentences("allan", **about)
     panel = Panel(layers, f"Allan deviation, {unit}", 190, logarithmic=True)
-    figure = Figure(f"{sensor}-allan", finding, caption, tuple(legend))
-    return chart(figure, description, [panel], "averaging time, s", kind="log")
+    texts = worded("allan", f"{sensor}-allan", tuple(legend), **about)
+    return chart(*texts, [panel], "averaging time, s", kind="log")
 
 
 def term_rows(noise: JSON | None) -> list[JSON]:
-    """Return a row for each term: its name, unit, and a text with interval or upper limit for each axis.
-
-    An axis whose noise was not identified has the text of an unknown number.
-    """
+    """Return a row for each term: its name, unit, and a text with interval or upper limit for each axis."""
     axes = [part["terms"] for part in ((noise or {}).get("axes") or {}).values()]
     if not any(axes):
         return []

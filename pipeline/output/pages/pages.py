@@ -183,12 +183,7 @@ def _environment() -> Templates:
     environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text}
     environment.filters |= {"parameter_texts": parameter_texts, "details": stage_details, "monte_carlo": monte_carlo_of}
     environment.filters |= {"script_data": script_data, "numeric": "#{}".format, "heading": heading}
-    environment.globals |= {
-        "asset": asset,
-        "unit_link": unit_link,
-        "Verdict": Verdict,
-        "budget_section": budget_section,
-    }
+    environment.globals |= {one.__name__: one for one in (asset, unit_link, Verdict, budget_section)}
     return environment
 
 

@@ -16,7 +16,7 @@ In a row of the tables, the columns of every campaign (``SUMMARY_COLUMNS``) come
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import chain
+from itertools import chain, combinations, permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -118,9 +118,7 @@ def reading_errors(part: JSON) -> list[Parameter]:
     K = np.linalg.inv(np.array(part["matrix"], float))
     element = _elements(part, K, np.kron(K, K.T))
     scale = [element(f"scale_factor_error_{a}", i, i) for i, a in enumerate(AXES)]
-    return scale + [
-        element(f"cross_axis_{a}{b}", i, j) for i, a in enumerate(AXES) for j, b in enumerate(AXES) if i != j
-    ]
+    return scale + [element(f"cross_axis_{AXES[i]}{AXES[j]}", i, j) for i, j in permutations(range(3), 2)]
 
 
 def sensor_errors(part: JSON) -> list[Parameter]:
@@ -133,7 +131,7 @@ def sensor_errors(part: JSON) -> list[Parameter]:
     J = (axes @ (changes / np.add.outer(sizes, sizes)) @ axes.T).reshape(9, 9).T
     element = _elements(part, P, J)
     scale = [element(f"scale_factor_{a}", i, i) for i, a in enumerate(AXES)]
-    return scale + [element(f"cross_axis_{AXES[i]}{AXES[j]}", i, j) for i, j in ((0, 1), (0, 2), (1, 2))]
+    return scale + [element(f"cross_axis_{AXES[i]}{AXES[j]}", i, j) for i, j in combinations(range(3), 2)]
 
 
 def _elements(part: JSON, matrix: np.ndarray, J: np.ndarray) -> Callable[[str, int, int], Parameter]:
@@ -183,10 +181,7 @@ def parameter_rows(sensor: str, part: JSON, data_sheet: DataSheet) -> list[JSON]
 def summary_row(
     unit: str, calibration: JSON, validation: JSON | None, diagnosis: JSON | None, units_table_row: dict[str, str]
 ) -> JSON:
-    """Return a unit's row: a dict from column to value, or None.
-
-    ``calibration, validation, diagnosis``: as in their files; ``units_table_row``: the unit's row of ``units.csv``.
-    """
+    """Return a unit's row: a dict from column to value, or None; ``units_table_row``: its row of ``units.csv``."""
     error = calibration.get("error") or {}
     file = f"{error['file']}: " if error.get("file") else ""
     row: JSON = dict.fromkeys(SUMMARY_COLUMNS) | {
@@ -234,10 +229,7 @@ def sheet_columns(row: JSON) -> dict[str, str]:
 
 
 def unit_parameters(calibration: JSON, sensor_model: Sensor) -> list[tuple[Any, ...]]:
-    """Return a row with the columns ``PARAMETER_KEYS`` for each parameter of a unit; none for a failed unit.
-
-    These are the fitted parameters, and the elements of P that a sensor file limits.
-    """
+    """Return a row of ``PARAMETER_KEYS`` for each fitted parameter and each limited element of P; none if it failed."""
     rows = []
     for sensor in [s for s in SENSORS if calibration.get(s)]:
         fitted = fitted_parameters(calibration[sensor])

@@ -58,7 +58,7 @@ from pipeline.output.pages.chart import (
     Panel,
     SampleMarks,
     chart,
-    sentences,
+    worded,
 )
 from pipeline.output.pages.group_charts import Point, bars, stems
 from pipeline.output.pages.pages import measured, number, percent, unit_text
@@ -161,10 +161,7 @@ class _BinnedMean:
     error: Values
 
     def excess(self, wander: Values) -> float:
-        """Return the mean square of the means over the variance of noise and wander, of the worst axis.
-
-        ``wander``: standard deviations by axis.
-        """
+        """Return the mean square of the means over the variance of noise and wander, of the worst axis."""
         filled = np.isfinite(self.mean[:, 0])
         ratio = self.mean[filled] ** 2 / (self.error[filled] ** 2 + wander**2)
         return float(ratio.mean(axis=0).max())
@@ -201,10 +198,7 @@ def _binned_mean(covariate: Values, error: Values, finite: Mask, mean_square: Va
 
 
 def covariates(found: list[Residual], wander: Values) -> dict[str, _BinnedMean]:
-    """Return binned means over all recordings by covariate, the largest excess first.
-
-    Of the components of the specific force only the one with the largest excess is returned.
-    """
+    """Return binned means over all recordings by covariate, the largest excess first; of one force component only."""
     out: dict[str, _BinnedMean] = {}
     errors: dict[tuple[int, ...], tuple[Values, Mask, Values]] = {}  # by the recordings that have a covariate
     for label, value in COVARIATES.items():
@@ -244,9 +238,8 @@ def harmonic_noise(residual: Residual, white: Values, wander: Values, time: floa
     ``time``: correlation time of the wander, s.
     """
     motion = residual.motion
-    assert motion.angle is not None  # noqa: S101
     duration = max(float(np.ptp(motion.time)), 1e-9)
-    turns = max(float(np.abs(np.diff(motion.angle)).sum()) / 360.0, 1.0)
+    turns = max(float(np.abs(np.diff(np.asarray(motion.angle))).sum()) / 360.0, 1.0)
     frequency = np.arange(HARMONICS + 1) * turns / duration
     spectrum = 2.0 * float(wander.max()) ** 2 * time / (1.0 + (2.0 * np.pi * frequency * time) ** 2)
     of_white = float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(residual.angle_bins[1], 1))) / RESIDUAL_BINS
@@ -308,10 +301,7 @@ def _harmonics(sensor: str, name: str, amplitudes: Values, level: Values) -> Fig
 
 
 def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -> Figure:
-    """Draw readings and model over a turn, and below them the residual of each axis with the band of +-2 sigma.
-
-    Without a noise model, sigma follows from the scatter of the residual.
-    """
+    """Draw readings and model over a turn, and below them the residual of each axis with the band of +-2 sigma."""
     unit, motion, name = SENSOR_UNITS[sensor], residual.motion, residual.recording.name
     turns = motion.angle is not None and np.ptp(motion.angle) > 1.0
     x = motion.angle if turns and motion.angle is not None else motion.time
@@ -331,8 +321,8 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
     ratio, by_encoder = float((rms / sigma).max()), float(residual.reference_noise.max())
     by_reference = (AXES[int(np.argmax(residual.reference_noise))], by_encoder) if known and by_encoder else None
     about = {"name": name, "ratio": ratio, "outside": outside, "reference": by_reference, "known": known}
-    finding, caption, description = sentences("model", **about, rms=rms.tolist(), unit=unit, noise=NOISE_ALONE_RATIO)
-    figure = Figure(f"{sensor}-{name}", finding, caption, (*AXES_LEGEND, ("c5", "model")))
+    about |= {"rms": rms.tolist(), "unit": unit, "noise": NOISE_ALONE_RATIO}
+    figure, description = worded("model", f"{sensor}-{name}", (*AXES_LEGEND, ("c5", "model")), **about)
     label, kind = ("angle of the rate table, deg", "angle") if turns else ("time, s", "")
     return chart(figure, description, panels, label, kind=kind)
 
@@ -369,9 +359,8 @@ def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
         return None
     excluded, prior = sum(row["excluded"] for row in shown), prior_limit()
     counts = {"count": len(shown), "excluded": excluded, "others": len(shown) - MOST_LIMITS}
-    finding, caption, _ = sentences("limits", **counts, below=EXCLUDED * prior, prior=prior)
+    figure, _ = worded("limits", f"{sensor}-limits", **counts, below=EXCLUDED * prior, prior=prior)
     points = [Point(row["label"], row["share"], 3) for row in shown[:MOST_LIMITS]]
-    figure = Figure(f"{sensor}-limits", finding, caption)
     label = "upper limit over the data sheet's limit (logarithmic)"
     return bars(figure, points, label, levels={"limit of the sensor file": 1.0})
 
@@ -395,8 +384,9 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
     brackets = _brackets(shown, selected)
     best = max((r for r in entries if r["effect"] not in selected), key=_evidence, default=None)
     value = _evidence(next((r for r in entries if r["effect"] == (selected or [None])[0]), {}))
-    finding, caption, _ = sentences(
+    figure, _ = worded(
         "ranking",
+        f"{sensor}-ranking",
         selected=selected,
         value=value,
         best=best,
@@ -407,7 +397,6 @@ def ranking(sensor: str, found: JSON) -> Figure | None:
         others=len(entries) - len(shown),
         hidden=shortened([plain(h["effect"]) for h in hidden], MOST_HIDDEN),
     )
-    figure = Figure(f"{sensor}-ranking", finding, caption)
     label = "ΔBIC (linear to ±10, logarithmic beyond)"
     levels = {f"threshold {MIN_DELTA_BIC:g}": MIN_DELTA_BIC}
     return bars(figure, rows, label, levels=levels, kind="symlog", brackets=brackets)
@@ -467,8 +456,8 @@ def added_variable(sensor: str, found: JSON) -> Figure | None:
     slopes = "; ".join(dict.fromkeys(_coefficient(p) for p in shown["panels"]))
     x_unit = _column_unit(best["unit"], unit)
     shown = {"coefficient": _coefficient(best), "slopes": slopes, "straight": straight, "scatter": scatter}
-    finding, caption, description = sentences("added_variable", effect=effect, **shown)
-    figure = Figure(f"{sensor}-added-variable", finding, caption, (("c5", "slope = parameter"),))
+    legend = (("c5", "slope = parameter"),)
+    figure, description = worded("added_variable", f"{sensor}-added-variable", legend, effect=effect, **shown)
     label = f"column of {what}, minus all other columns" + (f", {x_unit}" if x_unit else "")
     return chart(figure, description, panels, label)
 
@@ -520,11 +509,9 @@ def unexplained(sensor: str, found: JSON) -> list[Figure]:
             panels.append(Panel(layers, f"{panel['axis']}, {unit}", 76, {"": 0.0}))
         reaches = [f"{p['axis']} up to {number(float(np.abs(p['mean']).max()))} {unit}" for p in shown["panels"]]
         about = {"covariate": covariate, "entry": entries.get(covariate, {}), "reaches": reaches}
-        about |= {"fitted": bool(scatter)}
-        follow = all(mean_square < ON_THE_LINE for mean_square in scatter)
-        finding, caption, description = sentences("unexplained", **about, follow=follow)
+        about |= {"fitted": bool(scatter), "follow": all(mean_square < ON_THE_LINE for mean_square in scatter)}
         legend = (("c5", "suggested shape"),) if scatter else ()
-        figure = Figure(f"{sensor}-unexplained-{covariate}", finding, caption, legend)
+        figure, description = worded("unexplained", f"{sensor}-unexplained-{covariate}", legend, **about)
         label = SIGNAL_NAMES.get(shown["signal"], f"what the axis should read, {SENSOR_UNITS[sensor]}")
         kind = "angle" if shown["signal"] == "angle" else ""
         figures.append(chart(figure, description, panels, label, kind=kind))

@@ -77,9 +77,8 @@ def render(
 ) -> str:
     """Return the page of one unit as HTML.
 
-    ``calibration, validation, diagnosis``: as in their files, the last two None where their stage failed;
-    ``recordings``: after the filter, may be empty; ``settings``: the unit's resolved configuration; ``words``: the
-    diagnosis of each sensor in sentences; ``incomplete``: ``stage`` and ``message`` of what could not be made.
+    ``validation, diagnosis``: None where their stage failed; ``recordings``: after the filter, may be empty; ``words``:
+    the diagnosis of each sensor in sentences; ``incomplete``: ``stage`` and ``message`` of what could not be made.
     """
     row = summary_row(str(calibration.get("unit")), calibration, validation, diagnosis, {})
     validation, diagnosis, words = validation or {}, diagnosis or {}, words or {}
@@ -101,7 +100,7 @@ def render(
         sensors.append(shown)
     determining = settings.only(settings.model_fields_set - {"stated", "certificate"})
     determining["config_sha256"] = settings.stated.config_sha256
-    page: str = template("unit.html").render(
+    return template("unit.html").render(
         calibration=calibration,
         ok=ok,
         problems=state_of(row | {"incomplete": "; ".join(f"{r['stage']}: {r['message']}" for r in incomplete)}).kinds,
@@ -126,7 +125,6 @@ def render(
         command=run_command(settings.stated.run) if settings.stated.run else None,
         settings_text=json_text(dict(sorted(determining.items()))),
     )
-    return page
 
 
 def found_mounting(calibration: JSON) -> JSON | None:
@@ -200,8 +198,7 @@ def _sensor(
 def use_rows(part: JSON, noise: JSON | None) -> list[JSON]:
     """Return what a user of the calibration needs by axis: bias and matrix with U, and the noise terms N, B and K.
 
-    A row has ``name``, ``key`` of its definition, ``texts`` of x, y, z and U, and ``unit`` with an SI prefix. ``part``,
-    ``noise``: the sensor's parts of a calibration, and of its ``noise``.
+    A row has ``name``, ``key`` of its definition, ``texts`` of x, y, z and U, and ``unit`` with an SI prefix.
     """
     bias, matrix = fitted_parameters(part)[BIAS], fitted_parameters(part)[MATRIX]
     rows: list[JSON] = []
@@ -243,10 +240,7 @@ def files_read(inputs: list[JSON] | None) -> list[JSON]:
 
 
 def rest_rows(part: JSON) -> list[JSON]:
-    """Return the rests that were found in the readings, in order of time: used, held out or left out, and why.
-
-    ``part`` contains them in ``rests``, or in the ``details`` of the stages of a fit.
-    """
+    """Return the rests that were found in the readings, in order of time: used, held out or left out, and why."""
     found = [part.get("rests") or {}, *(stage.get("details") or {} for stage in part.get("stages") or [])]
     keys = {use: f"rests_{use.replace(' ', '_')}" for use in USES}
     rows = [{**r, "use": use} for rests in found for use, key in keys.items() for r in rests.get(key) or []]

@@ -32,10 +32,10 @@ import numpy as np
 
 from pipeline.core.records import (
     BETWEEN_ATTITUDES_S,
-    Integers,
     Mask,
     Recording,
     Values,
+    ends_of_runs,
     finite_rows,
     median,
     noise_of_steps,
@@ -105,16 +105,8 @@ class Settling:
 
 def runs(mask: Mask) -> Spans:
     """Return the (start, stop) index pairs of the runs of True in a mask."""
-    starts, stops = _edges(mask)
+    starts, stops = ends_of_runs(mask)
     return list(zip(starts.tolist(), stops.tolist(), strict=True))
-
-
-def _edges(mask: Mask) -> tuple[Integers, Integers]:
-    """Return where the runs of True in a mask start and stop."""
-    padded = np.zeros(len(mask) + 2, bool)
-    padded[1:-1] = mask
-    edges = np.flatnonzero(padded[1:] != padded[:-1])
-    return edges[::2], edges[1::2]
 
 
 def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> Mask:
@@ -124,7 +116,7 @@ def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> M
     recording begins with the rest.
     """
     still = np.abs(rate) < RATE_AT_REST_DPS
-    starts, stops = _edges(still)
+    starts, stops = ends_of_runs(still)
     settled = np.repeat(time[starts] + settling, stops - starts)
     if still[:1].any():
         settled[: stops[0]] = -np.inf
