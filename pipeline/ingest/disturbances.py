@@ -44,6 +44,7 @@ from pipeline.core.records import (
     median,
     noise_of_steps,
     rotation_deg,
+    runs_of,
 )
 from pipeline.ingest.quality_flags import GAP
 
@@ -297,9 +298,7 @@ def _pieces(recording: Recording) -> Index:
         return none
     size = max(MIN_PIECE_SAMPLES, round(PIECE_S / recording.interval))
     settling = int(np.ceil(SETTLING_S / recording.interval))
-    padded = np.zeros(len(still) + 2, bool)
-    padded[1:-1] = still
-    rests = np.flatnonzero(padded[1:] != padded[:-1]).reshape(-1, 2)
+    rests = runs_of(still)
     rests = rests[rests[:, 1] - rests[:, 0] >= MIN_PIECE_SAMPLES + 2 * settling]
     length = rests[:, 1] - rests[:, 0] - 2 * settling
     parts = -(-length // size)

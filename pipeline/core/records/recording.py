@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.interpolate import BSpline
 
-    from imu_logs.log import Integers, Mask, Note, Values
+    from imu_logs.log import Index, Integers, Mask, Note, Values
     from pipeline.core.settings import Sensor
 
 ReturnedQuantity = TypeVar("ReturnedQuantity")
@@ -418,6 +418,13 @@ def motion_at_rest(time: NDArray[np.float64]) -> Motion:
 def finite_rows(values: Values) -> Mask:
     """Return whether each row of (n, k) values is finite: (n,); column by column, in a sixth of the time."""
     return np.asarray(np.isfinite(values, order="F").all(axis=1))
+
+
+def runs_of(mask: Mask) -> Index:
+    """Return start and stop of each run of True in a mask: (k, 2) array."""
+    padded = np.zeros(len(mask) + 2, bool)
+    padded[1:-1] = mask
+    return np.flatnonzero(padded[1:] != padded[:-1]).reshape(-1, 2)
 
 
 def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -32,7 +32,6 @@ import numpy as np
 
 from pipeline.core.records import (
     BETWEEN_ATTITUDES_S,
-    Integers,
     Mask,
     Recording,
     Values,
@@ -40,6 +39,7 @@ from pipeline.core.records import (
     median,
     noise_of_steps,
     once,
+    runs_of,
 )
 from pipeline.physics.signal.filters import filter_autocovariance, stretch_starts
 from pipeline.physics.signal.quiet_motion import (
@@ -105,16 +105,7 @@ class Settling:
 
 def runs(mask: Mask) -> Spans:
     """Return the (start, stop) index pairs of the runs of True in a mask."""
-    starts, stops = _edges(mask)
-    return list(zip(starts.tolist(), stops.tolist(), strict=True))
-
-
-def _edges(mask: Mask) -> tuple[Integers, Integers]:
-    """Return where the runs of True in a mask start and stop."""
-    padded = np.zeros(len(mask) + 2, bool)
-    padded[1:-1] = mask
-    edges = np.flatnonzero(padded[1:] != padded[:-1])
-    return edges[::2], edges[1::2]
+    return [(start, stop) for start, stop in runs_of(mask).tolist()]
 
 
 def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> Mask:
@@ -124,7 +115,7 @@ def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> M
     recording begins with the rest.
     """
     still = np.abs(rate) < RATE_AT_REST_DPS
-    starts, stops = _edges(still)
+    starts, stops = runs_of(still).T
     settled = np.repeat(time[starts] + settling, stops - starts)
     if still[:1].any():
         settled[: stops[0]] = -np.inf
