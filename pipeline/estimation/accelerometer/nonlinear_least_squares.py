@@ -275,7 +275,7 @@ def _fit_partly(rows: Orientations, gravity_g: float, prior: WanderPrior, data_s
         solved = _fitted(rows, gravity_g, prior, held, partly=True)
         return solved, solved.uncertainty
 
-    return with_limits(dict(zip(PARAMETERS, limits_of_parameters(data_sheet).tolist(), strict=True)), solve_with)
+    return with_limits(limits_of_parameters(data_sheet), solve_with)
 
 
 def _unused(rows: Orientations) -> str:
