@@ -9,7 +9,7 @@ table: dwells of stop-and-go turns, or single samples of continuous turns.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -43,7 +43,6 @@ from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, us
 ROLE, HELD_OUT = "rests", "validation"
 SOAK, ATTITUDES = "soak", "attitudes"  # kinds of recordings in the sheet; times of attitudes do not count
 BY_HAND = ("", "moves")  # kinds with rests and moves by hand, of which some are held out; "": without a sheet
-OF_ALL = ("clock_shared", "kinds", "swings", "repeats", "scatter_time")  # fields of ``Rests`` that are no arrays
 PASSED, MOST = 20, 0.5  # temperatures between the ends of a soak; the share of them that makes a second cycle
 
 
@@ -227,8 +226,8 @@ class Rests:
 
     def select(self, index: Mask | slice) -> Self:
         """Return some of the rests."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in OF_ALL}
-        return replace(self, **{name: values[index] for name, values in arrays.items()})
+        arrays: dict[str, Any] = {name: v[index] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, **arrays)
 
     def variance(self, white: Values) -> Values:
         """Return the variance of each mean by white noise, (3,), of a sample and by rounding: (m, 3) array.
