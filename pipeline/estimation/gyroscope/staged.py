@@ -50,6 +50,7 @@ from pipeline.estimation.stages import FitStage, StageInput, details_on_table
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import TurnPart, blocks_of_samples, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
+from pipeline.physics.signal.filters import filter_autocovariance
 from pipeline.physics.signal.rests import runs
 
 EstimatedStep = tuple[Subtract | Multiply, dict[str, tuple[float, str]]]
@@ -280,8 +281,6 @@ def _memory(recording: Recording) -> float:
     if applied["name"] == "none":
         return 0.0
     try:
-        from pipeline.physics.signal.filters import filter_autocovariance  # noqa: PLC0415  (needed for filtered recordings only)
-
         covariance = np.abs(filter_autocovariance(recording))
     except (ConfigurationError, KeyError):
         return KNOWN_DELAYS_TO_SETTLE * float(applied["delay_s"])
