@@ -56,10 +56,7 @@ class RestSplit:
 
 
 def holdout_interval(recordings: Sequence[Recording], procedure: Procedure) -> int:
-    """Return k if every k-th rest is held out; 0 if none is held out.
-
-    With a recording for validation, or fewer rests than ``holdout_from``, none is held out.
-    """
+    """Return k if every k-th rest is held out; 0 with held-out motion or fewer rests than ``holdout_from``."""
     every, fewest = procedure.holdout_every, procedure.holdout_from
     if not every or any(recording.role == HELD_OUT for recording in recordings):
         return 0
@@ -156,10 +153,7 @@ def rest_means(recording: Recording, rests: Sequence[Rest], sensor: str = "accel
 
 
 def nearest_to_reference(temperature: Values) -> int:
-    """Return the part of a soak nearest to 25 degC, to which the effects of temperature refer; (k,) array, degC.
-
-    Without a temperature the middle one.
-    """
+    """Return the part of a soak, (k,) degC, nearest to 25 degC; the middle one without a temperature."""
     off = np.abs(temperature - REFERENCE_TEMPERATURE)
     return len(off) // 2 if np.isnan(off).all() else int(np.nanargmin(off))
 

@@ -325,10 +325,7 @@ def last_fit(calibration: SensorCalibration) -> FitStage:
 
 
 def check_stages(sensor: str, stages: Sequence[str]) -> None:
-    """Raise ``ConfigurationError`` if a stage of a method lacks what it needs, or loses what an earlier one changed.
-
-    ``stages``: of the sensor, in order.
-    """
+    """Raise ``ConfigurationError`` if a stage, of those in order, lacks what it needs or loses an earlier change."""
     for i, stage in enumerate(stages):
         found, module = declared(sensor, stage), stage_module(sensor, stage)
         if "readings" in found.changes and found.known is None:

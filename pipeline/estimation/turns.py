@@ -117,8 +117,7 @@ def settled(part: TurnPart) -> Mask:
 def steady_turns(part: TurnPart, memory: float) -> Mask:
     """Return the samples in the steady parts of a turn about one axis, without the settling of a filter.
 
-    ``memory``: the settling time, s. Of a shorter turn the middle is used: the filter's error there is a small share of
-    the rate.
+    ``memory``: the settling time, s. Of a shorter turn the middle is used, where the filter's error is small.
     """
     motion = part.motion
     if motion.axis is None or motion.rate is None:
@@ -287,10 +286,9 @@ class RowGroups:
 
     @cached_property
     def _pieces(self) -> Pieces:
-        """The pieces of all rows.
+        """The pieces of all rows: each sample of a short row, a longer row, parts of a long one.
 
-        A piece is a sample of a short row, a longer row, or at rest, where the motion next to the rest enters by a
-        shift, a part of a row, shorter towards its ends.
+        Parts are shorter towards its ends: the motion next to a rest enters it by a shift.
         """
         size = self.count.astype(int)
         starts = np.repeat(size <= ALL_SAMPLES, size)

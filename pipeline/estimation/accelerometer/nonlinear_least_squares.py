@@ -115,7 +115,6 @@ class _Solved:
 
     @property
     def rows(self) -> slice:
-        """The m rows."""
         return slice(self.model.rests_equations)
 
     @property

@@ -418,10 +418,7 @@ class CorrectedForces:
 
 
 def follow(extremes: Extremes, names: Sequence[str], start: CorrectedForces | None = None) -> CorrectedForces:
-    """Run stages one after the other, each on the output of the one before.
-
-    ``start``: output of the stage before the first.
-    """
+    """Run stages one after the other, each on the output of the one before; ``start``: output before the first."""
     found = start or CorrectedForces()
     for step in found.steps:
         extremes = extremes.corrected(step)

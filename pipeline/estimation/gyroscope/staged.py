@@ -137,10 +137,7 @@ class CorrectedRates:
 
 
 def follow(response: Response, names: Sequence[str], start: Sequence[CorrectionStep] = ()) -> CorrectedRates:
-    """Run stages one after the other, each on the output of the one before.
-
-    ``start``: the correction by the stages before the first of ``names``.
-    """
+    """Run stages one after the other, each on the output of the one before; ``start``: the correction so far."""
     found = CorrectedRates([*start])
     for step in found.steps:
         response = response.after(step)
@@ -170,10 +167,7 @@ def estimates_of(recordings: Sequence[Recording], settings: Settings) -> Estimat
 
 
 def fit(task: StageInput) -> SensorCalibration:
-    """Run one stage of the staged method (``pipeline.estimation.stages``).
-
-    Role ``gyroscope``, on a table; also role ``static`` if these recordings hold no rest.
-    """
+    """Run one stage of the staged method; role ``gyroscope``, on a table, also ``static`` if these hold no rest."""
     name, recordings, previous, settings = task.stage, task.recordings, task.previous, task.settings
     if settings.procedure.sheet is not None and name == "bias":
         from pipeline.estimation.gyroscope.cholesky_lu import fit_bias  # noqa: PLC0415  (only for turns of a sheet)

@@ -295,10 +295,7 @@ def _directions(calibration: SensorCalibration) -> Values:
 def model_of(
     recordings: Sequence[Recording], calibration: SensorCalibration, noise: Noise | None, settings: Settings
 ) -> AccelerometerModel | None:
-    """Return the model of the recordings' rests, or None if there are none.
-
-    ``calibration``: of the accelerometer's method.
-    """
+    """Return the model of the recordings' rests, or None if there are none; ``calibration``: of the method."""
     rests = rests_of("accelerometer", recordings, settings.procedure, calibration)
     if rests is None:
         return None

@@ -82,10 +82,7 @@ def register(effect: Effect) -> None:
 
 
 def register_user_effects(files: UserEffectFiles) -> None:
-    """Register the effects of a job's configuration.
-
-    Raises ``ConfigurationError`` if one is faulty.
-    """
+    """Register the effects of a job's configuration; raise ``ConfigurationError`` if one is faulty."""
     for definition in files.formulas:
         register(effect_from(definition, f"effect {definition.get('name')} of the campaign"))
     for entry in files.python:
@@ -178,10 +175,7 @@ def built_in_files() -> dict[str, Path]:
 
 
 def read_effect_files(files: Iterable[Path]) -> dict[str, Effect]:
-    """Read the effects of YAML files, by name.
-
-    Raises ``ConfigurationError`` with a line for each faulty file.
-    """
+    """Read the effects of YAML files, by name; raise ``ConfigurationError`` with a line for each faulty file."""
     found: dict[str, Effect] = {}
     problems = []
     for file in files:
@@ -195,10 +189,7 @@ def read_effect_files(files: Iterable[Path]) -> dict[str, Effect]:
 
 
 def read_effect_file(file: Path, *, built_in: bool = False) -> Effect:
-    """Read the effect of one YAML file.
-
-    Raises ``ConfigurationError`` with the faulty line.
-    """
+    """Read the effect of one YAML file; raise ``ConfigurationError`` with the faulty line."""
     text = read_text(file, MAX_EFFECT_BYTES, "an effect")
     given = load_yaml(text, str(file), MAX_EFFECT_VALUES)
     if not isinstance(given, dict):

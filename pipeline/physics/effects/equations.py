@@ -117,14 +117,12 @@ class _OfTurns(DeclaredEffect):
     each = 2
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the columns of the turn axis, zeros for the others."""
         out = np.zeros((len(motion.time), 3, 3 * self.each))
         for parameter, column in self._columns(sensor, motion, K):
             out[:, :, parameter] = column
         return out
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the sum of the columns of the turn axis."""
         added = np.zeros((len(motion.time), 3))
         for parameter, column in self._columns(sensor, motion, K):
             added += column * values[parameter]

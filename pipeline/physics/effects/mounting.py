@@ -220,7 +220,6 @@ class _Mounting(Effect):
         return tuple(EffectParameter(f"theta_{a}", "deg", f"turn of the unit, its part about body {a}") for a in "xyz")
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the derivative by central differences."""
         return rotation_columns(sensor, motion, K, turned_back, values)
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
@@ -262,12 +261,10 @@ class _InSession(Effect):
         return self.base.parameters(sensor)
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the regressors of the effect in its session, zeros elsewhere."""
         found = self.base.regressors(sensor, motion, K, values)
         return found if motion.setup == self.session else np.zeros_like(found)
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the reading of the effect in its session, zeros elsewhere."""
         if motion.setup == self.session:
             return self.base.reading(sensor, motion, K, values)
         return np.zeros((len(motion.time), 3))
@@ -275,10 +272,7 @@ class _InSession(Effect):
 
 @cache
 def in_session(name: str, base: Effect) -> Effect:
-    """Return the effect ``<base>@<session>``.
-
-    Raises ``ConfigurationError`` if the effect moves the motion in time, or is not linear in its parameters.
-    """
+    """Return ``<base>@<session>``; raise ``ConfigurationError`` if the effect moves in time or is not linear."""
     if base.moves or base.nonlinear:
         raise ConfigurationError(
             f"effect {name}: {base.name} cannot be one setup's own, as the fit is not linear in it; name {base.name}"

@@ -210,8 +210,6 @@ def _stretch(time: Values, angle: Values, error: float) -> tuple[Values, float]:
 
 
 class _Smoother:
-    """The smoothing of an angle for one order of difference."""
-
     def __init__(self, time: Values, angle: Values, variance: float, order: int) -> None:
         self.angle, self.variance, self.order = angle, variance, order
         n = len(time)

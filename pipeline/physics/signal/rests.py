@@ -248,7 +248,6 @@ def settling_of(recording: Recording) -> Settling | None:
 
 
 def _shortest(recording: Recording) -> int:
-    """Return the samples of the shortest rest."""
     interval = _interval(recording)
     return max(5, round(WINDOW_S / interval), round(SHORTEST_REST_S / interval))
 
