@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.core.errors import ConfigurationError, NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.core.records import (
     AFTER_BASE,
     AXES,
@@ -58,7 +58,6 @@ EstimatedStep = tuple[Subtract | Multiply, dict[str, tuple[float, str]]]
 # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
 DIFFERENCE_STEP_DPS = 1e-5
 FORGOTTEN_RATE_CHANGE = 1e-5  # share of a change of rate in a filter's output, below which the filter has settled
-KNOWN_DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alone
 FIT_STAGES = {
     "bias": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias",)),
     "orthogonality_and_misalignment": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("matrix",)),
@@ -271,13 +270,9 @@ def samples_of(parts: Sequence[TurnPart], recordings: Sequence[Recording]) -> Tu
 
 def _memory(recording: Recording) -> float:
     """Return the settling time of the recording's filter, s."""
-    applied = recording.filter
-    if applied["name"] == "none":
+    if recording.filter["name"] == "none":
         return 0.0
-    try:
-        covariance = np.abs(filter_autocovariance(recording))
-    except (ConfigurationError, KeyError):
-        return KNOWN_DELAYS_TO_SETTLE * float(applied["delay_s"])
+    covariance = np.abs(filter_autocovariance(recording))
     return float(np.flatnonzero(covariance > FORGOTTEN_RATE_CHANGE * covariance[0])[-1] + 1) * recording.interval
 
 
