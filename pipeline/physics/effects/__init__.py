@@ -72,12 +72,7 @@ def leaving_out(names: Iterable[str]) -> Iterator[None]:
 
 
 def register(effect: Effect) -> None:
-    """Add a user's effect to the catalogue of this process; it replaces one of the same name.
-
-    Raises ``ConfigurationError`` if a built-in effect has that name.
-    """
-    if effect.name in built_in_files():
-        raise ConfigurationError(f"effect {effect.name}: a built-in effect has this name; choose another name")
+    """Add a user's effect to the catalogue of this process; it replaces one of the same name, which is not built in."""
     _registered[effect.name] = effect
 
 
