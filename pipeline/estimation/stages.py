@@ -441,10 +441,9 @@ def _in_order(fitted: FittedEffect, sensor: str) -> FittedEffect:
 
 
 def unknown_uncertainty(sensor: str, method: Method) -> dict[str, str]:
-    """Return the entry of a budget for a given calibration whose file states no uncertainty; empty if it does."""
+    """Return the entry of a budget for a given calibration whose file states no uncertainty; else empty."""
     given = method.given
-    assert given is not None  # noqa: S101  (``is_given``)
-    if given[sensor] is None or given[sensor]["uncertain"]:
+    if given is None or not given.get(sensor) or given[sensor]["uncertain"]:
         return {}
     return {GIVEN_SOURCE: f"{given['source']} states no uncertainty: none is known, and zeros stand for it"}
 
