@@ -268,15 +268,13 @@ class RowGroups:
             return self._with_trajectory(found, motion, partial(self._mean_at, found, still))
         return self._with_trajectory(found, motion, self._at)
 
-    def _at(self, trajectory: Callable[..., Motion | None], offset: float | Values = 0.0, **lag: float) -> Motion:
+    def _at(self, trajectory: Callable[..., Motion], offset: float | Values = 0.0, **lag: float) -> Motion:
         """Return the motion at the rows' samples shifted in time; ``offset``: of the rows."""
         if isinstance(offset, np.ndarray):
             samples = np.zeros(self.total)
             samples[self.kept] = np.repeat(offset, self.count.astype(int))
             offset = samples
-        motion = trajectory(offset=offset, **lag)
-        assert motion is not None  # noqa: S101
-        return self.motion(motion)
+        return self.motion(trajectory(offset=offset, **lag))
 
     @staticmethod
     def _with_trajectory(rows: Motion, motion: Motion, at: Callable[..., Motion]) -> Motion:
@@ -303,8 +301,8 @@ class RowGroups:
     def _mean_at(
         self,
         here: Motion,
-        logged: Callable[[], Motion | None],
-        trajectory: Callable[..., Motion | None],
+        logged: Callable[[], Motion],
+        trajectory: Callable[..., Motion],
         offset: float | Values = 0.0,
         **lag: float,
     ) -> Motion:
@@ -316,7 +314,6 @@ class RowGroups:
         if isinstance(offset, np.ndarray):
             offset = np.repeat(offset, np.diff(np.append(pieces.of_row, len(pieces.first))))
         moved = trajectory(offset=offset, rows=pieces, **lag)
-        assert moved is not None  # noqa: S101
 
         def later(name: str) -> Values:
             values, mean = getattr(moved, name), getattr(here, name)

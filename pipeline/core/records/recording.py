@@ -361,8 +361,8 @@ class Motion:
     rate: Values | None  # (n,), deg/s
     axis: int | None  # of the turn
     still: Mask  # (n,), samples at rest, after settling
-    at_offset: Callable[..., Motion | None] | None = None
-    at_lag: Callable[..., Motion | None] | None = None
+    at_offset: Callable[..., Motion] | None = None
+    at_lag: Callable[..., Motion] | None = None
     level: Values | None = None  # (n, 3, 3), rows: axes of the level frame in the body frame; None: unknown heading
     # (n, 3), unit vector of the current turn or, at rest, of the last turn; zeros before the first turn. None: not
     # computed yet (pipeline.physics.effects.base.turning_direction).

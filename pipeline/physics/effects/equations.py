@@ -271,9 +271,8 @@ def shifted(motion: Motion, offset: float | Values) -> Motion:
     )
 
 
-def _seen_from(motion: Motion, moved: Motion | None) -> Motion:
+def _seen_from(motion: Motion, moved: Motion) -> Motion:
     """Return a moved motion with the rests and directions of the logged motion."""
-    assert moved is not None  # noqa: S101
     return moved.changed(still=motion.still, direction=motion.direction)
 
 

@@ -82,9 +82,8 @@ def turned_back(values: Values) -> Values:
     return np.asarray(np.swapaxes(turn_by_vector(np.radians(values)), -1, -2))
 
 
-def _rotated_at(trajectory: Callable[..., Motion | None], rotation: Values, **at: Any) -> Motion | None:  # noqa: ANN401
-    there = trajectory(**at)
-    return there and rotated(there, rotation)
+def _rotated_at(trajectory: Callable[..., Motion], rotation: Values, **at: Any) -> Motion:  # noqa: ANN401
+    return rotated(trajectory(**at), rotation)
 
 
 class _OfRecordings(DeclaredEffect):
