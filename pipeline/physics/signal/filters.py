@@ -63,7 +63,8 @@ BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
     "band_stop": "bandstop",
 }
 KERNEL_BLOCK = 128  # cells at once: their kernels stay in the processor's cache
-NARROWEST_S = 0.5  # below the thermal time constant of a package, which is seconds
+# bandwidths: over about 30 s; below the thermal time constant of a package, which is seconds
+WIDEST_S, NARROWEST_S = 10.0, 0.5
 RELATIVE_ROUNDING = 1e-12  # relative: some thousand roundings of a double
 MIN_SWING_DEGC = 1.0  # twice the step of a coarse thermometer, 0.5 degC
 DISTINCT, AT_ENDS = 6.0, 5.0  # standard deviations; by how much the variance is larger at the ends of a file
@@ -271,11 +272,9 @@ def _timing_notes(recording: Recording) -> tuple[Note, ...]:
     return tuple(notes)
 
 
-def smooth_temperature(time: Values, temperature: Values, bandwidth: float = 10.0) -> Values:
-    """Return a smoothed temperature log: (n,) array, degC; ``time`` increases.
-
-    ``bandwidth``, s, is the largest standard deviation of the kernel; 10 s averages over about 30 s.
-    """
+def smooth_temperature(time: Values, temperature: Values) -> Values:
+    """Return a smoothed temperature log: (n,) array, degC; ``time`` increases."""
+    bandwidth = WIDEST_S
     if len(time) < 3 or time[-1] == time[0]:
         return _local_line(time, temperature, bandwidth)
     step = np.abs(np.diff(temperature))
