@@ -170,10 +170,7 @@ def estimates(terms: Terms, covariance: Values) -> dict[str, tuple[Values, Value
 
 
 def offered(names: Sequence[str], terms: Terms, covariance: Values, data_sheet: DataSheet, sensor: str) -> list[str]:
-    """Return the selected effects for ``auto``: none if one of them is not possible (``gates.possible``).
-
-    ``terms``: of the fit, the last parameters of its ``covariance``.
-    """
+    """Return the selected effects for ``auto``, none if one is not possible; ``terms``: the last of ``covariance``."""
     limits, found = limits_of(sensor, data_sheet), estimates(terms, covariance)
     every = all(possible(*found[name], limits[name]) for name in names if name in limits)
     return list(names) if every or data_sheet.accept_implausible else []

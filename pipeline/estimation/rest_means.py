@@ -83,10 +83,7 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
 
 
 def held_out_rests(recordings: Sequence[Recording], procedure: Procedure) -> dict[str, list[Rest]]:
-    """Return the held-out rests of recordings of role ``rests``, by the name of the recording; empty if there are none.
-
-    The move before a held-out rest is held out, too.
-    """
+    """Return the held-out rests of role ``rests`` by recording; the move before each of them is held out, too."""
     every = holdout_interval(recordings, procedure)
     return {r.name: list(split_rests(r, every).held_out) for r in recordings if every and r.role == ROLE}
 

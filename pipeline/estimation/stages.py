@@ -310,10 +310,7 @@ def _declaration(sensor: str, stage: str) -> FitStage | None:
 
 
 def declarations(calibration: SensorCalibration) -> dict[str, FitStage]:
-    """Return the declarations of the stages of a calibration's method, by name, in order.
-
-    A further result of a stage, such as ``faces``, has no declaration.
-    """
+    """Return the declarations of a calibration's stages by name, in order; a further result, as ``faces``, has none."""
     found = {stage.name: _declaration(calibration.sensor, stage.name) for stage in calibration.stages}
     return {name: stage for name, stage in found.items() if stage is not None}
 

@@ -201,10 +201,7 @@ def implausible(rows: Sequence[LimitRow]) -> list[Entry]:
 
 
 def beyond_limits(rows: Sequence[LimitRow]) -> list[Entry]:
-    """Return the fitted parameters of ``limited`` whose absolute value exceeds the limit, the largest ratio first.
-
-    An entry has ``parameter``, ``value``, ``unit``, ``limit`` and ``ratio``.
-    """
+    """Return as ``implausible``, without a cause, the parameters beyond the limit, the largest ratio first."""
     return [_entry(row) for row in rows if abs(row[1]) > row[4]]
 
 

@@ -109,10 +109,7 @@ def fitted_effect(name: str, sensor: str, values: Values) -> FittedEffect:
 
 
 def effect(name: str) -> Effect:
-    """Return one effect by name; ``<effect>@<setup>`` acts in one session (``pipeline.physics.effects.mounting``).
-
-    Raises ``ConfigurationError`` if there is none of that name.
-    """
+    """Return an effect by name; ``<effect>@<setup>`` acts in one session. ``ConfigurationError`` if there is none."""
     if name in _registered:
         return _registered[name]
     if name in built_in_files():

@@ -255,10 +255,7 @@ class WarmUp(DeclaredEffect):
 
 
 def shifted(motion: Motion, offset: float | Values) -> Motion:
-    """Return the motion at ``time + offset``, s: a float or (n,) array.
-
-    Without a trajectory between the samples the truth is extrapolated linearly.
-    """
+    """Return the motion at ``time + offset``, s, a float or (n,) array; without a trajectory by a straight line."""
     if not np.any(offset):
         return motion
     if motion.at_offset is not None:

@@ -63,10 +63,7 @@ REQUIRED = ("name", "owner", "sensors", "meaning")
 
 
 class DeclaredEffect(Effect):
-    """An effect with name, owner, parameters and texts from a file; a subclass has its equation.
-
-    ``definition``: the content of the file of a user's effect.
-    """
+    """An effect by a file, whose equation a subclass has; ``definition``: the content of a user's file."""
 
     def __init__(self, declared: Declaration, definition: dict[str, Any] | None = None) -> None:
         self.declared, self.definition = declared, definition

@@ -275,10 +275,7 @@ def _interval(recording: Recording) -> float:
 
 
 def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noise_variance: float) -> list[Rest]:
-    """Return rests of given start and stop; a rest in which the sensor moved is marked as refused.
-
-    ``noise_variance``: of the specific force at rest, g^2, summed over the axes.
-    """
+    """Return rests of given ends, refused where the sensor moved; ``noise_variance``: of all axes of the force, g^2."""
     rests = [Rest(start, stop) for start, stop in intervals]
     pairs = zip(rests, _reasons(recording, rests), strict=True)
     reasons = [_turn(recording, r) or _scatter(recording, r, noise_variance) or of_rate for r, of_rate in pairs]
