@@ -53,7 +53,7 @@ from pipeline.core.records import (
     SensorCalibration,
     Values,
     base_values,
-    matrix_of,
+    shaped,
 )
 from pipeline.core.settings import DataSheet
 from pipeline.core.verdicts import WITH_THEM
@@ -109,8 +109,8 @@ def with_open(sensor: str, fit: SensorCalibration, hidden: Mapping[str, Mapping[
     U, k = (values[BASE] for values in (parameters.expanded_uncertainty, parameters.coverage_factor))
     found = list(_open(sensor, fit, hidden, U))
     u_open = np.sqrt((U / k) ** 2 + sum((a**2 / 3.0 for _, a, _ in found), np.zeros(len(U))))
-    largest = [{"effect": name, "up_to": _shaped(a), "reason": reason} for name, a, reason in found]
-    return {"open": largest, "uncertainty_with_open": _shaped(k * u_open)}
+    largest = [{"effect": name, "up_to": shaped(a), "reason": reason} for name, a, reason in found]
+    return {"open": largest, "uncertainty_with_open": shaped(k * u_open)}
 
 
 def _open(
@@ -154,10 +154,6 @@ def _open(
 def _largest(calibration: SensorCalibration, name: str) -> Values:
     """Return the largest change of bias and matrix by an effect, (12,)."""
     return np.asarray(np.abs(calibration.at_limits[name]).sum(axis=1))
-
-
-def _shaped(values: Values) -> dict[str, Any]:
-    return {"bias": values[:3].tolist(), "matrix": matrix_of(values).tolist()}
 
 
 def both_figures(part: Mapping[str, Any] | None) -> dict[str, tuple[float, float]]:
