@@ -333,9 +333,8 @@ class Orientations:
     @property
     def white(self) -> Values:
         """Standard deviation of a raw sample about the mean of its row: (3,) array, g; 0 where no row has two."""
-        filters = [self.recordings[i].filter for i in self.rests.recording[:1]]
-        gain = float(filters[0].get("noise_gain", 1.0)) if filters else 1.0
-        return self.rests.white / (gain or 1.0)
+        gains = [float(self.recordings[i].filter["noise_gain"]) for i in self.rests.recording[:1]]
+        return self.rests.white / (gains[0] if gains else 1.0)
 
 
 def orientations_of(recordings: Sequence[Recording], settings: Settings) -> Orientations:
