@@ -260,7 +260,6 @@ def limited_effects(sensor: str, part: Mapping[str, Any], limits: Mapping[str, f
 
 
 def _scale_cause(sensor: str, factors: np.ndarray) -> str:
-    """Return the likely cause of scale factors far from 1."""
     mean = float(np.mean(factors))
     if np.ptp(factors) > EQUAL_SPREAD * mean:
         return "another column, counts per unit or axis map of this axis, or a damaged axis"

@@ -129,7 +129,6 @@ class _Solved:
 
     @property
     def spare(self) -> int:
-        """Rows and pseudo-observations minus parameters."""
         return len(self.residual) - len(PARAMETER_NAMES)
 
     @property

@@ -96,7 +96,6 @@ class _OfRecordings(DeclaredEffect):
     what: str
 
     def of_recordings(self, setups: Mapping[str, str]) -> Self:
-        """Return the effect with parameters for these recordings, name to setup."""
         bound = copy(self)
         bound.recordings = tuple(dict.fromkeys(self.owner_of(*pair) for pair in setups.items()))
         bound.definition = {"name": self.name, "recordings": list(bound.recordings)}
@@ -107,7 +106,6 @@ class _OfRecordings(DeclaredEffect):
         return recording
 
     def covers(self, motion: Motion) -> bool:
-        """Return whether there are parameters for the recording of a motion."""
         return self.owner_of(motion.recording, motion.setup) in self.recordings
 
     def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
