@@ -197,8 +197,7 @@ def rows_of_parts(parts: Sequence[TurnPart]) -> tuple[list[RowGroups], Blocks]:
         starts = np.zeros(used, bool)
         starts[blocks.first[(blocks.first >= edge) & (blocks.first < edge + used)] - edge] = True
         starts[found.first] = True
-        first = np.flatnonzero(starts)
-        rows.append(replace(found, first=first, count=np.diff(np.append(first, used)).astype(float)))
+        rows.append(replace(found, first=np.flatnonzero(starts)))
         edge += used
     starts = np.cumsum(np.concatenate([each.count for each in rows]))  # of the next row
     return rows, replace(blocks, first=np.searchsorted(starts, blocks.first, side="right"))
@@ -210,8 +209,12 @@ class RowGroups:
 
     kept: Index  # (k,); indices of the samples
     first: Index  # (m,); where in ``kept`` each group starts
-    count: Values  # (m,); samples of each group
     total: int  # samples of the recording
+
+    @cached_property
+    def count(self) -> Values:
+        """Samples of each group: (m,) array."""
+        return np.diff(np.append(self.first, len(self.kept))).astype(float)
 
     @cached_property
     def _key(self) -> tuple[bytes, bytes, int]:
@@ -242,8 +245,7 @@ class RowGroups:
         moving = np.any((scatter > most[:, None] * white) & (white > 0), axis=1) & (size > 1)
         starts = np.repeat(moving, size)
         starts[self.first] = True
-        first = np.flatnonzero(starts)
-        return replace(self, first=first, count=np.diff(np.append(first, len(kept))).astype(float))
+        return replace(self, first=np.flatnonzero(starts))
 
     def means(self, values: Values) -> Values:
         """Return the group means of (n, ...) values: (m, ...) array."""
@@ -340,7 +342,7 @@ def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> RowGroups:
 def _grouped(motion: Motion, kept: Index, together: bool) -> RowGroups:  # noqa: FBT001
     """Group samples of a motion as ``rows_of`` does; ``kept``: their indices, (k,)."""
     if len(kept) == 0:
-        return RowGroups(kept, kept, np.zeros(0), len(motion.time))
+        return RowGroups(kept, kept, len(motion.time))
     still, time = motion.still[kept], motion.time[kept]
     sense = np.where(still, 0.0, 1.0 if motion.rate is None else np.sign(motion.rate[kept]))
     alike = (still[1:] == still[:-1]) & (sense[1:] == sense[:-1]) & (np.diff(kept) == 1) & together
@@ -356,7 +358,7 @@ def _grouped(motion: Motion, kept: Index, together: bool) -> RowGroups:  # noqa:
         first = np.flatnonzero(np.concatenate([[True], ~alike | np.any(np.diff(piece, axis=1) != 0, axis=0)]))
         if len(first) <= MANY_ROWS:
             break
-    return RowGroups(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(motion.time))
+    return RowGroups(kept, first, len(motion.time))
 
 
 def reference_valid(motion: Motion) -> Mask:

@@ -154,10 +154,7 @@ def _in_blocks(motions: Sequence[Motion], fit: LinearMap) -> tuple[Sequence[Moti
     if size < 2:
         return motions, fit
     firsts = [np.arange(0, len(motion.time), size) for motion in motions]
-    groups = [
-        RowGroups(np.arange(n), first, np.diff(np.append(first, n)).astype(float), n)
-        for first, n in zip(firsts, (len(motion.time) for motion in motions), strict=True)
-    ]
+    groups = [RowGroups(np.arange(len(m.time)), first, len(m.time)) for first, m in zip(firsts, motions, strict=True)]
     edges = np.cumsum([0, *(rows.total for rows in groups[:-1])])
     starts = np.concatenate([first + edge for first, edge in zip(firsts, edges, strict=True)])
     summed = {id(A): np.add.reduceat(A, starts, axis=1) for A in fit.weights}
