@@ -38,7 +38,7 @@ from pipeline.checks.at_rest import check_axes, check_static, with_rates_at_rest
 from pipeline.checks.evidence import place, refusal
 from pipeline.checks.mounting import check_mounting
 from pipeline.checks.reference import check_motion, check_turns
-from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Note, Recording, Values, ends_of_runs, finite_rows
+from pipeline.core.records import SENSOR_UNITS, SENSORS, Index, Note, Recording, Values, finite_rows, runs_of
 from pipeline.core.settings import Settings, Table
 from pipeline.ingest.quality_flags import EXPECTED_CHANCE_RUNS
 from pipeline.physics.kinematics import normal_gravity_g
@@ -335,7 +335,7 @@ def _check_pair(one: Recording, two: Recording, first: Index, second: Index) -> 
     first, second = first[order], second[order]
     common, longest = len(first), max(one.samples, two.samples)
     ahead = (np.diff(first) <= APART) & (np.diff(second) > 0) & (np.diff(second) <= APART)
-    starts, stops = ends_of_runs(ahead)
+    starts, stops = runs_of(ahead).T
     if not starts.size:
         return
     best = int(np.argmax(stops - starts))

@@ -65,24 +65,17 @@ def starts_of(
     """Return the terms from which a fit starts, every combination of the effects' starts.
 
     ``observed``: for recordings by hand only the sensor. ``known``: a calibration, at whose effects a fit starts.
-    ``accelerometer``, for the gyroscope: its mountings. Raises ``ConfigurationError`` if an effect is unknown, named
-    twice, contained in another, or not one of this sensor.
+    ``accelerometer``, for the gyroscope: its mountings. Raises ``ConfigurationError`` if an effect is unknown or named
+    twice; the configuration has no effect of the other sensor alone, and none beside one that contains it.
     """
     sensor = observed if isinstance(observed, str) else observed.sensor
     recordings = {} if isinstance(observed, str) else turns_of(observed)
     if len(set(names)) != len(names):
         raise ConfigurationError(f"effects.{sensor} names an effect twice: {', '.join(names)}")
-    for name in names:
-        if within := [n for n in effect(name).contains if n in names]:
-            both = f"{name} and {within[0]}"
-            raise ConfigurationError(f"effects.{sensor} names {both}, which it contains: name one of them")
     fitted = {} if known is None else {e.name: e.values for e in known.effects}
     choices: list[list[EffectColumns]] = []
     for name in names:
         this = effect(name).of_recordings(recordings)
-        if sensor not in this.sensors:
-            owner = this.sensors[0]
-            raise ConfigurationError(f"effects.{sensor} names {name}, which is an effect of the {owner} alone")
         prior = None if isinstance(observed, str) else prior_of(this, observed, accelerometer, names)
         starts = this.starts(sensor) if prior is None or this.nonlinear else [prior.mean]
         if name in fitted and len(fitted[name]) == len(this.parameters(sensor)):
@@ -177,10 +170,7 @@ def estimates(terms: Terms, covariance: Values) -> dict[str, tuple[Values, Value
 
 
 def offered(names: Sequence[str], terms: Terms, covariance: Values, data_sheet: DataSheet, sensor: str) -> list[str]:
-    """Return the selected effects for ``auto``: none if one of them is not possible (``gates.possible``).
-
-    ``terms``: of the fit, the last parameters of its ``covariance``.
-    """
+    """Return the selected effects for ``auto``, none if one is not possible; ``terms``: the last of ``covariance``."""
     limits, found = limits_of(sensor, data_sheet), estimates(terms, covariance)
     every = all(possible(*found[name], limits[name]) for name in names if name in limits)
     return list(names) if every or data_sheet.accept_implausible else []

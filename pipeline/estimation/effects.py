@@ -32,10 +32,7 @@ FIT_STAGES = {"effects": FitStage(changes=ALL, accepts=("readings", *ALL), free=
 
 
 def fit(task: StageInput) -> SensorCalibration:
-    """Fit the effects of ``settings.effects`` together with bias and matrix, after every method.
-
-    Returns ``previous`` unchanged if there are no effects to add.
-    """
+    """Fit the effects of ``settings.effects`` with bias and matrix; return ``previous`` if there are none to add."""
     sensor, recordings, settings, noise = task.sensor, task.recordings, task.settings, task.noise
     before = task.previous or SensorCalibration(sensor)
     by_hand = is_multi_position(sensor, recordings.filtered)

@@ -140,10 +140,7 @@ class ErrorMixture:
     spare: float  # degrees of freedom of the scale of the noise
 
     def averaged(self) -> tuple[Values, Values]:
-        """Return the covariance of the mixture, (p, p), and the degrees of freedom, (p,).
-
-        Degrees of freedom are infinite for parameters without uncertainty.
-        """
+        """Return the covariance, (p, p), and the degrees of freedom, (p,), which are infinite without uncertainty."""
         mean = np.tensordot(self.weight, self.covariances, 1)
         average = np.diag(mean)
         known = average > 0.0
@@ -171,8 +168,7 @@ class ErrorMixture:
 def scaled_inverse(matrix: Values) -> Values:
     """Return the pseudo-inverse of a (p, p) symmetric matrix whose parameters have different units and sizes.
 
-    Rows and columns are scaled to a unit diagonal first, so that no small parameter is lost in the rounding of a large
-    one.
+    Rows and columns are scaled to a unit diagonal, so that rounding of a large parameter loses no small one.
     """
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     scale = np.outer(size, size)
@@ -487,10 +483,9 @@ def cholesky(matrix: Values) -> Values:
 
 
 def linear_convergence(A: Values, residual: Values, condition: float, rank: int) -> Convergence:
-    """Return the evidence that a linear estimate is a minimum.
+    """Return the evidence that a linear estimate is a minimum; ``condition``: of the scaled columns.
 
-    ``A``: (n, p), columns, the same for each channel. ``residual``: (n,) or (n, m), of m channels. ``condition``: of
-    the scaled columns.
+    ``A``: (n, p), columns, the same for each channel. ``residual``: (n,) or (n, m), of m channels.
     """
     products = np.abs(A.T @ residual)
     size = np.multiply.outer(np.linalg.norm(A, axis=0), np.linalg.norm(residual, axis=0))
@@ -525,10 +520,9 @@ def compared(results: ArrayLike, estimate: ArrayLike, expanded: ArrayLike, *, di
 
 
 def through(posterior: ErrorMixture, stated: Sequence[Values], results: Callable[[Values], Values]) -> Draw:
-    """Return a function that draws parameters.
+    """Return a function that draws parameters; ``results``: errors (t, q) to parameters (t, p).
 
-    ``posterior``: of the noise of q linear functions of the readings. ``stated``: (q, q), covariances by stated
-    accuracies. ``results``: errors (t, q) to parameters (t, p).
+    ``posterior``: of the noise of q linear functions of the readings. ``stated``: (q, q), by stated accuracies.
     """
 
     def draw(rng: np.random.Generator, count: int) -> Values:

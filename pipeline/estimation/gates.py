@@ -41,10 +41,7 @@ MAX_FALSE_DEPENDENCE = 1e-3  # probability that a complete model seems to depend
 
 
 def min_delta_bic(this: Effect, sensor: str, selected_gain: float = 0.0) -> float:
-    """Return the delta BIC above which an effect may be selected.
-
-    ``selected_gain``: G, 0 if no effect is selected.
-    """
+    """Return the delta BIC above which an effect may be selected; ``selected_gain``: G, 0 if none is selected."""
     least = MIN_DELTA_BIC_OF_SLOW if this.of_the_room(sensor) else MIN_DELTA_BIC
     return min(max(ERROR_OF_FIRST_ORDER * selected_gain, least), MAX_MIN_DELTA_BIC)
 

@@ -161,10 +161,9 @@ def _tested(x: Values, own: Values, freedom: Values, predicted: Prediction) -> t
 
 
 def with_prior(x: Values, own: Values, predicted: Prediction, known: Mask) -> WithPrior:
-    """Return an estimate with its prior.
+    """Return an estimate, ``x`` (p,) of covariance ``own`` (p, p), with its prior.
 
-    ``x``, ``own``: (p,), (p, p) of all parameters; ``known``: (p,), the q of them that are ``predicted``, (q,) arrays.
-    The others follow by their correlation.
+    ``known``: (p,), the q parameters that are ``predicted``, (q,) arrays; the others follow by their correlation.
     """
     mean, variance, freedom = predicted
     gain = own[:, known] @ scaled_inverse(own[np.ix_(known, known)] + np.diag(variance))

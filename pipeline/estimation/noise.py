@@ -99,10 +99,7 @@ MIN_NUISANCE_SINGULAR_VALUE = 1e-3  # singular value of unit columns, below whic
 
 
 def estimate_noise(sensor: str, recordings: Sequence[Recording], data_sheet: DataSheet) -> Noise:
-    """Return white noise and bias wander of a sensor.
-
-    Raises ``ConfigurationError`` if no recording holds readings of the sensor.
-    """
+    """Return white noise and bias wander of a sensor; raise ``ConfigurationError`` if it has no readings."""
     fitted = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
     return _not_below_rounding(_of_recordings(sensor, fitted, data_sheet), sensor, fitted, data_sheet)
 

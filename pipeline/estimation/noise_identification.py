@@ -123,17 +123,9 @@ class SeenTerm:
         return {"unit": self.unit, **vars(self.coefficient), **{k: vars(v) for k, v in constants.items() if v}}
 
 
-@dataclass(frozen=True)
-class UnseenTerm:
-    """A noise term that the recording does not show."""
-
-    unit: str
-    reason: str
-    upper_limit: float | None = None
-
-    def to_json(self) -> JSON:
-        """Return the published entry."""
-        return {"value": None, "interval": None, **vars(self)}
+def _unseen(unit: str, reason: str, upper_limit: float | None = None) -> JSON:
+    """Return the published entry of a term that the recording does not show."""
+    return {"value": None, "interval": None, "unit": unit, "reason": reason, "upper_limit": upper_limit}
 
 
 def identify_noise(recordings: Sequence[Recording], *, full: bool = True) -> dict[str, JSON]:
@@ -276,23 +268,24 @@ def _axis(
     weight = np.exp(-0.5 * (np.array([c.bic for c in candidates]) - best.bic))
     probability = (weight / weight.sum()).tolist()
     present = _present(best, bounds[0], regression)
-    seen = {term.name: term for term in present}
-    terms: dict[str, SeenTerm | UnseenTerm] = {}
+    seen = {term.name: term.to_json() for term in present}
+    terms: dict[str, JSON] = {}
     for kind in SINGLE:
         name = STOCHASTIC[kind]
         limit = None if kind in best.kinds else regression.scale * float(np.sqrt(bounds[1][kind]))
         reason = _reason(kind, regression.names(best), spectrum)
-        terms[name] = seen.get(name) or UnseenTerm(unit_of(name, unit), reason, limit)
+        terms[name] = seen.get(name) or _unseen(unit_of(name, unit), reason, limit)
     processes = [(term.correlation_time_s.value, term) for term in present if term.correlation_time_s]
     per = {"ramp": regression.span, "temperature": 1.0}
     slopes = {name: _slope(regression, best, spectrum, name, size) for name, size in per.items()}
     sinusoids = _sinusoids(regression, best)
-    others = [*(s for s in slopes.values() if isinstance(s, SeenTerm) and s.name == "ramp"), *sinusoids]
+    ramp, _ = slopes["ramp"]
+    others = [*([ramp] if ramp else []), *sinusoids]
     return {
         "terms": {
-            **{name: term.to_json() for name, term in terms.items()},
+            **terms,
             STOCHASTIC[MARKOV]: [term.to_json() for _, term in sorted(processes, key=lambda pair: pair[0])],
-            **{name: slope.to_json() for name, slope in slopes.items()},
+            **{name: entry for name, (_, entry) in slopes.items()},
             "sinusoid": [term.to_json() for term in sinusoids],
         },
         "reason": None,
@@ -324,16 +317,16 @@ def _stated(unit: str, stretches: Sequence[RestStretch], interval: float) -> JSO
     departure = np.abs(variance.T / np.maximum(sums, 1e-300) - 1.0) * np.sqrt(0.5 * freedom)
     axes: JSON = dict.fromkeys(AXES, CONSTANT_READINGS)
     for c in np.flatnonzero(np.isfinite(counts)).tolist():
-        terms: dict[str, SeenTerm | UnseenTerm] = {"temperature": UnseenTerm(f"{unit}/degC", NOT_OF_A_RUN)}
-        terms |= {name: UnseenTerm(unit_of(name, unit), NOT_OF_A_RUN) for name in ("quantisation", "ramp")}
+        terms = {"temperature": _unseen(f"{unit}/degC", NOT_OF_A_RUN)}
+        terms |= {name: _unseen(unit_of(name, unit), NOT_OF_A_RUN) for name in ("quantisation", "ramp")}
         for kind, square, limit in zip(N_B_K, squares[c], limits[c], strict=True):
             name, size = STOCHASTIC[kind], float(scale[c] * np.sqrt(square))
-            absent = UnseenTerm(unit_of(name, unit), NOT_SHOWN, float(scale[c] * np.sqrt(limit)))
-            terms[name] = SeenTerm(name, Bounded(size, None), unit_of(name, unit)) if size else absent
+            absent = _unseen(unit_of(name, unit), NOT_SHOWN, float(scale[c] * np.sqrt(limit)))
+            terms[name] = SeenTerm(name, Bounded(size, None), unit_of(name, unit)).to_json() if size else absent
         doubts = [OTHER_SPECTRUM] if departure[c].max() > MOST_DEPARTURE else []
         curves = {"tau_s": tau, "deviation": scale[c] * np.sqrt(variance[:, c]), "fit": scale[c] * np.sqrt(sums[c])}
         axes[AXES[c]] = {
-            "terms": {name: term.to_json() for name, term in terms.items()} | {STOCHASTIC[MARKOV]: [], "sinusoid": []},
+            "terms": terms | {STOCHASTIC[MARKOV]: [], "sinusoid": []},
             "reason": None,
             "ranking": [],
             "p_value": None,
@@ -450,16 +443,17 @@ def _sinusoids(regression: Regression, best: FittedComposition) -> list[SeenTerm
 
 def _slope(
     regression: Regression, best: FittedComposition, spectrum: Spectrum, name: str, per: float
-) -> SeenTerm | UnseenTerm:
-    """Return the term of a deterministic column; the column is ``per`` times its unit."""
+) -> tuple[SeenTerm | None, JSON]:
+    """Return the term of a deterministic column, if it is seen, and its entry; the column is ``per`` times its unit."""
     unit = f"{regression.unit}/degC" if name == "temperature" else unit_of(name, regression.unit)
     if name not in regression.optional:
-        return UnseenTerm(unit, NOT_FITTED[name])
+        return None, _unseen(unit, NOT_FITTED[name])
     column = 1 + regression.optional.index(name)
     columns = tuple(sorted({*best.columns, column}))
     fit = evaluate(spectrum, [TermTrial(int(best.fit.axis[0]), best.kinds, columns, best.parameters)])
     value = regression.scale / per * float(fit.beta[0, column - 1])
     spread = regression.scale / per * float(np.sqrt(fit.beta_covariance[0, column - 1, column - 1]))
     if column in best.columns:
-        return SeenTerm(name, Bounded.of(value, spread), unit)
-    return UnseenTerm(unit, "not seen", abs(value) + ONE_SIDED * spread)
+        term = SeenTerm(name, Bounded.of(value, spread), unit)
+        return term, term.to_json()
+    return None, _unseen(unit, "not seen", abs(value) + ONE_SIDED * spread)

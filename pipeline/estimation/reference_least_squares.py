@@ -14,7 +14,7 @@ where
 each channel is a linear problem with the same columns (1, u_x, u_y, u_z), fitted to the means of samples between which
 the motion changes little (``pipeline.estimation.turns.rows_of_parts``). A filtered reading is compared with
 ``b + K F u``, F the same filter. This is exact for any linear filter; a shift of u by the filter's delay would ignore
-its attenuation and be wrong in every ramp. Only if the filter cannot be reproduced, the shift ``u(t - delay)`` is used.
+its attenuation and be wrong in every ramp.
 
 With stop-and-go turns the accelerometer is fitted to the settled rests, otherwise to all samples. The gyroscope is
 fitted to all samples; if the table's rate is only the derivative of its logged angle, the ramps are not used.
@@ -29,7 +29,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core.errors import ConfigurationError, NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.core.records import AXES, BASE_COUNT, MATRIX, SensorCalibration, StageResult, Values
 from pipeline.estimation.candidates import bench_effects
 from pipeline.estimation.design import MIN_DESIGN_SINGULAR_VALUE, PART_OF_IT
@@ -67,7 +67,8 @@ def fit(task: StageInput, *, details: bool = True) -> SensorCalibration:
     sensor, recordings, settings, prior = task.sensor, task.recordings, task.settings, task.prior
     parts = [_select(sensor, part) for part in parts_of(recordings.filtered, sensor, settings.table, NAME)]
     readings = np.concatenate([part.reading(sensor) for part in parts])
-    truths = np.concatenate([_reference(sensor, part).compress(part.keep, axis=0) for part in parts])
+    ideal = (filtered(truth(sensor, part.motion), part.recording) for part in parts)
+    truths = np.concatenate([u.compress(part.keep, axis=0) for u, part in zip(ideal, parts, strict=True)])
     if not truths.any():
         raise NotObservableError(f"{sensor}: the table never moved in these recordings; {ADVICE[sensor]}")
     rows, blocks = rows_of_parts(parts)
@@ -128,16 +129,6 @@ def _select(sensor: str, part: TurnPart) -> TurnPart:
     sharp = rate > SHARP_CHANGE * np.max(np.abs(part.motion.angular_rate))
     sharp = np.convolve(sharp, np.ones(5), mode="same") > 0  # a spline rings about a corner
     return replace(part, keep=part.keep & ~sharp)
-
-
-def _reference(sensor: str, part: TurnPart) -> Values:
-    """Return the reading of an ideal sensor after the recording's filter: (n, 3) array."""
-    recording, motion = part.recording, part.motion
-    try:
-        return filtered(truth(sensor, motion), recording)
-    except (ConfigurationError, KeyError):
-        late = motion.at_offset(offset=-recording.filter["delay_s"]) if motion.at_offset else None
-        return truth(sensor, late or motion)
 
 
 def _require_observable(sensor: str, factors: ScaledColumns, X: Values) -> float:

@@ -9,7 +9,7 @@ table: dwells of stop-and-go turns, or single samples of continuous turns.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -43,7 +43,6 @@ from pipeline.physics.signal.rests import Rest, find_rests, rests_from_table, us
 ROLE, HELD_OUT = "rests", "validation"
 SOAK, ATTITUDES = "soak", "attitudes"  # kinds of recordings in the sheet; times of attitudes do not count
 BY_HAND = ("", "moves")  # kinds with rests and moves by hand, of which some are held out; "": without a sheet
-OF_ALL = ("clock_shared", "kinds", "swings", "repeats", "scatter_time")  # fields of ``Rests`` that are no arrays
 PASSED, MOST = 20, 0.5  # temperatures between the ends of a soak; the share of them that makes a second cycle
 
 
@@ -57,10 +56,7 @@ class RestSplit:
 
 
 def holdout_interval(recordings: Sequence[Recording], procedure: Procedure) -> int:
-    """Return k if every k-th rest is held out; 0 if none is held out.
-
-    With a recording for validation, or fewer rests than ``holdout_from``, none is held out.
-    """
+    """Return k if every k-th rest is held out; 0 with held-out motion or fewer rests than ``holdout_from``."""
     every, fewest = procedure.holdout_every, procedure.holdout_from
     if not every or any(recording.role == HELD_OUT for recording in recordings):
         return 0
@@ -87,10 +83,7 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
 
 
 def held_out_rests(recordings: Sequence[Recording], procedure: Procedure) -> dict[str, list[Rest]]:
-    """Return the held-out rests of recordings of role ``rests``, by the name of the recording; empty if there are none.
-
-    The move before a held-out rest is held out, too.
-    """
+    """Return the held-out rests of role ``rests`` by recording; the move before each of them is held out, too."""
     every = holdout_interval(recordings, procedure)
     return {r.name: list(split_rests(r, every).held_out) for r in recordings if every and r.role == ROLE}
 
@@ -157,10 +150,7 @@ def rest_means(recording: Recording, rests: Sequence[Rest], sensor: str = "accel
 
 
 def nearest_to_reference(temperature: Values) -> int:
-    """Return the part of a soak nearest to 25 degC, to which the effects of temperature refer; (k,) array, degC.
-
-    Without a temperature the middle one.
-    """
+    """Return the part of a soak, (k,) degC, nearest to 25 degC; the middle one without a temperature."""
     off = np.abs(temperature - REFERENCE_TEMPERATURE)
     return len(off) // 2 if np.isnan(off).all() else int(np.nanargmin(off))
 
@@ -227,8 +217,8 @@ class Rests:
 
     def select(self, index: Mask | slice) -> Self:
         """Return some of the rests."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in OF_ALL}
-        return replace(self, **{name: values[index] for name, values in arrays.items()})
+        arrays: dict[str, Any] = {name: v[index] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, **arrays)
 
     def variance(self, white: Values) -> Values:
         """Return the variance of each mean by white noise, (3,), of a sample and by rounding: (m, 3) array.
@@ -343,9 +333,8 @@ class Orientations:
     @property
     def white(self) -> Values:
         """Standard deviation of a raw sample about the mean of its row: (3,) array, g; 0 where no row has two."""
-        filters = [self.recordings[i].filter for i in self.rests.recording[:1]]
-        gain = float(filters[0].get("noise_gain", 1.0)) if filters else 1.0
-        return self.rests.white / (gain or 1.0)
+        gains = [float(self.recordings[i].filter["noise_gain"]) for i in self.rests.recording[:1]]
+        return self.rests.white / (gains[0] if gains else 1.0)
 
 
 def orientations_of(recordings: Sequence[Recording], settings: Settings) -> Orientations:

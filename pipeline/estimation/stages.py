@@ -310,10 +310,7 @@ def _declaration(sensor: str, stage: str) -> FitStage | None:
 
 
 def declarations(calibration: SensorCalibration) -> dict[str, FitStage]:
-    """Return the declarations of the stages of a calibration's method, by name, in order.
-
-    A further result of a stage, such as ``faces``, has no declaration.
-    """
+    """Return the declarations of a calibration's stages by name, in order; a further result, as ``faces``, has none."""
     found = {stage.name: _declaration(calibration.sensor, stage.name) for stage in calibration.stages}
     return {name: stage for name, stage in found.items() if stage is not None}
 
@@ -325,10 +322,7 @@ def last_fit(calibration: SensorCalibration) -> FitStage:
 
 
 def check_stages(sensor: str, stages: Sequence[str]) -> None:
-    """Raise ``ConfigurationError`` if a stage of a method lacks what it needs, or loses what an earlier one changed.
-
-    ``stages``: of the sensor, in order.
-    """
+    """Raise ``ConfigurationError`` if a stage, of those in order, lacks what it needs or loses an earlier change."""
     for i, stage in enumerate(stages):
         found, module = declared(sensor, stage), stage_module(sensor, stage)
         if "readings" in found.changes and found.known is None:
@@ -444,10 +438,9 @@ def _in_order(fitted: FittedEffect, sensor: str) -> FittedEffect:
 
 
 def unknown_uncertainty(sensor: str, method: Method) -> dict[str, str]:
-    """Return the entry of a budget for a given calibration whose file states no uncertainty; empty if it does."""
+    """Return the entry of a budget for a given calibration whose file states no uncertainty; else empty."""
     given = method.given
-    assert given is not None  # noqa: S101  (``is_given``)
-    if given[sensor] is None or given[sensor]["uncertain"]:
+    if given is None or not given.get(sensor) or given[sensor]["uncertain"]:
         return {}
     return {GIVEN_SOURCE: f"{given['source']} states no uncertainty: none is known, and zeros stand for it"}
 

@@ -139,10 +139,7 @@ def table_errors(reference: Reference, fit: LinearMap | BlockSums, estimated: Se
 def _stated_errors(
     reference: Reference, fit: LinearMap | BlockSums, estimated: Sequence[str] = ()
 ) -> tuple[list[tuple[str, float, str, Values]], dict[str, str]]:
-    """Return source, accuracy, its unit and the change of the parameters, (p, inputs), of each stated accuracy.
-
-    And reasons for those not included.
-    """
+    """Return source, accuracy, unit and effect, (p, inputs), of each stated accuracy, and reasons for the others."""
     stated, missing = [], {}
     setups = {motion.setup for motion in reference.motions}
     for source, key, unit, sensors, replaced_by, inputs, change in ACCURACIES:

@@ -117,8 +117,7 @@ def settled(part: TurnPart) -> Mask:
 def steady_turns(part: TurnPart, memory: float) -> Mask:
     """Return the samples in the steady parts of a turn about one axis, without the settling of a filter.
 
-    ``memory``: the settling time, s. Of a shorter turn the middle is used: the filter's error there is a small share of
-    the rate.
+    ``memory``: the settling time, s. Of a shorter turn the middle is used, where the filter's error is small.
     """
     motion = part.motion
     if motion.axis is None or motion.rate is None:
@@ -198,8 +197,7 @@ def rows_of_parts(parts: Sequence[TurnPart]) -> tuple[list[RowGroups], Blocks]:
         starts = np.zeros(used, bool)
         starts[blocks.first[(blocks.first >= edge) & (blocks.first < edge + used)] - edge] = True
         starts[found.first] = True
-        first = np.flatnonzero(starts)
-        rows.append(replace(found, first=first, count=np.diff(np.append(first, used)).astype(float)))
+        rows.append(replace(found, first=np.flatnonzero(starts)))
         edge += used
     starts = np.cumsum(np.concatenate([each.count for each in rows]))  # of the next row
     return rows, replace(blocks, first=np.searchsorted(starts, blocks.first, side="right"))
@@ -211,8 +209,12 @@ class RowGroups:
 
     kept: Index  # (k,); indices of the samples
     first: Index  # (m,); where in ``kept`` each group starts
-    count: Values  # (m,); samples of each group
     total: int  # samples of the recording
+
+    @cached_property
+    def count(self) -> Values:
+        """Samples of each group: (m,) array."""
+        return np.diff(np.append(self.first, len(self.kept))).astype(float)
 
     @cached_property
     def _key(self) -> tuple[bytes, bytes, int]:
@@ -243,8 +245,7 @@ class RowGroups:
         moving = np.any((scatter > most[:, None] * white) & (white > 0), axis=1) & (size > 1)
         starts = np.repeat(moving, size)
         starts[self.first] = True
-        first = np.flatnonzero(starts)
-        return replace(self, first=first, count=np.diff(np.append(first, len(kept))).astype(float))
+        return replace(self, first=np.flatnonzero(starts))
 
     def means(self, values: Values) -> Values:
         """Return the group means of (n, ...) values: (m, ...) array."""
@@ -269,15 +270,13 @@ class RowGroups:
             return self._with_trajectory(found, motion, partial(self._mean_at, found, still))
         return self._with_trajectory(found, motion, self._at)
 
-    def _at(self, trajectory: Callable[..., Motion | None], offset: float | Values = 0.0, **lag: float) -> Motion:
+    def _at(self, trajectory: Callable[..., Motion], offset: float | Values = 0.0, **lag: float) -> Motion:
         """Return the motion at the rows' samples shifted in time; ``offset``: of the rows."""
         if isinstance(offset, np.ndarray):
             samples = np.zeros(self.total)
             samples[self.kept] = np.repeat(offset, self.count.astype(int))
             offset = samples
-        motion = trajectory(offset=offset, **lag)
-        assert motion is not None  # noqa: S101
-        return self.motion(motion)
+        return self.motion(trajectory(offset=offset, **lag))
 
     @staticmethod
     def _with_trajectory(rows: Motion, motion: Motion, at: Callable[..., Motion]) -> Motion:
@@ -287,10 +286,9 @@ class RowGroups:
 
     @cached_property
     def _pieces(self) -> Pieces:
-        """The pieces of all rows.
+        """The pieces of all rows: each sample of a short row, a longer row, parts of a long one.
 
-        A piece is a sample of a short row, a longer row, or at rest, where the motion next to the rest enters by a
-        shift, a part of a row, shorter towards its ends.
+        Parts are shorter towards its ends: the motion next to a rest enters it by a shift.
         """
         size = self.count.astype(int)
         starts = np.repeat(size <= ALL_SAMPLES, size)
@@ -305,8 +303,8 @@ class RowGroups:
     def _mean_at(
         self,
         here: Motion,
-        logged: Callable[[], Motion | None],
-        trajectory: Callable[..., Motion | None],
+        logged: Callable[[], Motion],
+        trajectory: Callable[..., Motion],
         offset: float | Values = 0.0,
         **lag: float,
     ) -> Motion:
@@ -318,7 +316,6 @@ class RowGroups:
         if isinstance(offset, np.ndarray):
             offset = np.repeat(offset, np.diff(np.append(pieces.of_row, len(pieces.first))))
         moved = trajectory(offset=offset, rows=pieces, **lag)
-        assert moved is not None  # noqa: S101
 
         def later(name: str) -> Values:
             values, mean = getattr(moved, name), getattr(here, name)
@@ -345,7 +342,7 @@ def rows_of(motion: Motion, valid: Mask, *, together: bool = True) -> RowGroups:
 def _grouped(motion: Motion, kept: Index, together: bool) -> RowGroups:  # noqa: FBT001
     """Group samples of a motion as ``rows_of`` does; ``kept``: their indices, (k,)."""
     if len(kept) == 0:
-        return RowGroups(kept, kept, np.zeros(0), len(motion.time))
+        return RowGroups(kept, kept, len(motion.time))
     still, time = motion.still[kept], motion.time[kept]
     sense = np.where(still, 0.0, 1.0 if motion.rate is None else np.sign(motion.rate[kept]))
     alike = (still[1:] == still[:-1]) & (sense[1:] == sense[:-1]) & (np.diff(kept) == 1) & together
@@ -361,7 +358,7 @@ def _grouped(motion: Motion, kept: Index, together: bool) -> RowGroups:  # noqa:
         first = np.flatnonzero(np.concatenate([[True], ~alike | np.any(np.diff(piece, axis=1) != 0, axis=0)]))
         if len(first) <= MANY_ROWS:
             break
-    return RowGroups(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(motion.time))
+    return RowGroups(kept, first, len(motion.time))
 
 
 def reference_valid(motion: Motion) -> Mask:

@@ -154,10 +154,7 @@ def _in_blocks(motions: Sequence[Motion], fit: LinearMap) -> tuple[Sequence[Moti
     if size < 2:
         return motions, fit
     firsts = [np.arange(0, len(motion.time), size) for motion in motions]
-    groups = [
-        RowGroups(np.arange(n), first, np.diff(np.append(first, n)).astype(float), n)
-        for first, n in zip(firsts, (len(motion.time) for motion in motions), strict=True)
-    ]
+    groups = [RowGroups(np.arange(len(m.time)), first, len(m.time)) for first, m in zip(firsts, motions, strict=True)]
     edges = np.cumsum([0, *(rows.total for rows in groups[:-1])])
     starts = np.concatenate([first + edge for first, edge in zip(firsts, edges, strict=True)])
     summed = {id(A): np.add.reduceat(A, starts, axis=1) for A in fit.weights}
@@ -175,10 +172,7 @@ def centred(motions: Sequence[Motion]) -> list[Motion]:
 def changes_by_hand(
     model: Model, fitted: FitByHand, gain: Values, modelled: Collection[str], data_sheet: DataSheet
 ) -> dict[str, Values]:
-    """Return the change of bias and matrix by each effect at its limits, (12, p), of a fit to rests and moves.
-
-    ``gain``: of ``gain_of``.
-    """
+    """Return ``changes_on_table`` of a fit to rests and moves; ``gain``: of ``gain_of``."""
     model = _at_mean_temperature(model)
     if isinstance(model, AccelerometerModel):
         model.after_moves = True
@@ -374,10 +368,7 @@ def lines_on_table(
     settings: Settings,
     estimated: Sequence[str] | None = None,
 ) -> tuple[list[Contribution], list[Contribution], dict[str, str]]:
-    """Return the contributions of rounding and of the stated accuracies, and reasons for those not included.
-
-    Arguments: see ``budgeted``.
-    """
+    """Return the contributions of rounding and of stated accuracies, and reasons for others; see ``budgeted``."""
     found, missing = table_errors(reference, fit, estimated or ())
     if estimated and TILT in estimated and tilt_like_zeros(reference.motions, estimated) is not None:
         missing["levelling"] = ACROSS

@@ -40,11 +40,11 @@ from pipeline.core.records import (
     Recording,
     Values,
     continuous,
-    ends_of_runs,
     level_in_body,
     median,
     noise_of_steps,
     rotation_deg,
+    runs_of,
 )
 from pipeline.ingest.quality_flags import GAP
 
@@ -295,7 +295,7 @@ def _pieces(recording: Recording) -> Index:
         return none
     size = max(MIN_PIECE_SAMPLES, round(PIECE_S / recording.interval))
     settling = int(np.ceil(SETTLING_S / recording.interval))
-    rests = np.stack(ends_of_runs(still), axis=1)
+    rests = runs_of(still)
     rests = rests[rests[:, 1] - rests[:, 0] >= MIN_PIECE_SAMPLES + 2 * settling]
     length = rests[:, 1] - rests[:, 0] - 2 * settling
     parts = -(-length // size)

@@ -33,7 +33,7 @@ from imu_logs.log import Log
 from imu_logs.profile import Checks
 from imu_logs.units import ATTITUDE, DEGREES, FORCE_UNITS, TABLE_CHANNELS, TRIADS
 from pipeline.core.errors import IngestError
-from pipeline.core.records import SENSOR_UNITS, Index, Integers, Mask, Note, Recording, Values, ends_of_runs, median
+from pipeline.core.records import SENSOR_UNITS, Index, Integers, Mask, Note, Recording, Values, median, runs_of
 from pipeline.core.settings import Sensor
 
 GAP, CLIPPED, STUCK = np.uint16(1), np.uint16(2), np.uint16(4)  # bits of ``Recording.flags``
@@ -276,9 +276,9 @@ def _stuck_rows(same: Mask, share: float) -> Index:
     longest = max(SHORTEST_RUN, int(np.ceil(np.log(EXPECTED_CHANCE_RUNS / len(same)) / np.log(p))) + 1)
     if not _in_a_row(same, longest - 1):
         return np.zeros(0, np.intp)
-    starts, stops = ends_of_runs(same)
-    long = stops - starts + 1 >= longest
-    return np.concatenate([np.arange(a, b + 1) for a, b in zip(starts[long], stops[long], strict=True)])
+    runs = runs_of(same)
+    long = runs[runs[:, 1] - runs[:, 0] + 1 >= longest]
+    return np.concatenate([np.arange(a, b + 1) for a, b in long])
 
 
 def _in_a_row(same: Mask, count: int) -> bool:
@@ -429,7 +429,7 @@ def rests_of(force: Values, interval_s: float) -> list[tuple[int, int]]:
     noise = BLOCK_NOISE * float(np.sqrt(2.0 * np.quantile(scatter, 0.1) / width))
     slow = np.linalg.norm(np.diff(means, axis=0), axis=1) <= max(np.radians(LARGEST_STEP_DEG) * size, noise)
     still &= np.append(slow, False) | np.append(False, slow)
-    found = [(int(a), int(b)) for a, b in zip(*ends_of_runs(still), strict=True) if b - a >= 2]
+    found = [(a, b) for a, b in runs_of(still).tolist() if b - a >= 2]
     drift = max(np.radians(LARGEST_DRIFT_DEG) * size, noise)
     return [(a * width, b * width) for a, b in found if np.linalg.norm(means[a:b] - means[a], axis=1).max() <= drift]
 

@@ -130,10 +130,9 @@ class Formula:
 
 @lru_cache(maxsize=256)
 def parse(text: str) -> Formula:
-    """Parse a formula.
+    """Parse a formula; raise ``ConfigurationError`` with the position of a fault.
 
-    Raises ``ConfigurationError`` with the position in the text if it contains anything but numbers, signals, functions
-    and operators, or is too long or too deeply nested.
+    It contains numbers, signals, functions and operators alone, and is neither too long nor too deeply nested.
     """
     line = " ".join(text.split())
     if not line:

@@ -80,28 +80,22 @@ def earth_of(table: Table) -> Values | None:
 
 def table_motion(recording: Recording, table: Table) -> Motion | None:
     """Return ``reference_motion`` with gravity, latitude and azimuth of a table's configuration."""
-    one_shaft = table.azimuth_of == "turn_axis"
-    return reference_motion(recording, table.gravity_g, earth_of(table), one_shaft=one_shaft)
-
-
-def reference_motion(
-    recording: Recording, gravity_g: float = 1.0, earth_rate_level: Values | None = None, *, one_shaft: bool = False
-) -> Motion | None:
-    """Return the motion of a recording by the log of the table; None where the recording has no such log.
-
-    ``recording``: with ``table_angle`` and an axis, or with ``table_attitude``. ``earth_rate_level``: Earth's rotation
-    in the level frame, (3,), deg/s, or None. ``one_shaft``: level x is the axis about which the encoder counts
-    right-handed, the same in all turns (``table.azimuth_of``), not the body axis at angle 0. Raises ``InputError`` if
-    there are too few samples to differentiate the log.
-    """
-    earth = None if earth_rate_level is None else tuple(earth_rate_level.tolist())
-    return _reference_motion(recording, gravity_g, earth, one_shaft=one_shaft)
+    earth, one_shaft = earth_of(table), table.azimuth_of == "turn_axis"
+    known = None if earth is None else tuple(earth.tolist())
+    return reference_motion(recording, table.gravity_g, known, one_shaft=one_shaft)
 
 
 @once_of_log
-def _reference_motion(
-    recording: Recording, gravity_g: float, earth: tuple[float, ...] | None, *, one_shaft: bool
+def reference_motion(
+    recording: Recording, gravity_g: float = 1.0, earth: tuple[float, ...] | None = None, *, one_shaft: bool = False
 ) -> Motion | None:
+    """Return the motion of a recording by the log of the table; None where the recording has no such log.
+
+    ``recording``: with ``table_angle`` and an axis, or with ``table_attitude``. ``earth``: Earth's rotation in the
+    level frame, deg/s, or None. ``one_shaft``: level x is the axis about which the encoder counts right-handed, the
+    same in all turns (``table.azimuth_of``), not the body axis at angle 0. Raises ``InputError`` if there are too few
+    samples to differentiate the log.
+    """
     if recording.axis is not None and recording.table_angle is not None:
         build: Callable[..., Motion] = partial(_motion_of_turn, shaft=recording.sense if one_shaft else 0)
     elif recording.table_attitude is not None:

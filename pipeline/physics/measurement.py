@@ -245,10 +245,7 @@ def log_motion(
 
 
 def fields_used(sensor: str, effects: Iterable[FittedEffect]) -> set[str]:
-    """Return the fields of a motion that effects depend on.
-
-    Raises ``ConfigurationError`` if one depends on a field that no log of a sensor holds, such as a table's angle.
-    """
+    """Return the fields of a motion that effects depend on; raise ``ConfigurationError`` for one that no log has."""
     seen: set[str] = set()
     for fitted in effects:
         looked_at = effect_of(fitted).fields(sensor, fitted.values)

@@ -53,7 +53,7 @@ from pipeline.core.records import (
     SensorCalibration,
     Values,
     base_values,
-    matrix_of,
+    shaped,
 )
 from pipeline.core.settings import DataSheet
 from pipeline.core.verdicts import WITH_THEM
@@ -109,8 +109,8 @@ def with_open(sensor: str, fit: SensorCalibration, hidden: Mapping[str, Mapping[
     U, k = (values[BASE] for values in (parameters.expanded_uncertainty, parameters.coverage_factor))
     found = list(_open(sensor, fit, hidden, U))
     u_open = np.sqrt((U / k) ** 2 + sum((a**2 / 3.0 for _, a, _ in found), np.zeros(len(U))))
-    largest = [{"effect": name, "up_to": _shaped(a), "reason": reason} for name, a, reason in found]
-    return {"open": largest, "uncertainty_with_open": _shaped(k * u_open)}
+    largest = [{"effect": name, "up_to": shaped(a), "reason": reason} for name, a, reason in found]
+    return {"open": largest, "uncertainty_with_open": shaped(k * u_open)}
 
 
 def _open(
@@ -156,10 +156,6 @@ def _largest(calibration: SensorCalibration, name: str) -> Values:
     return np.asarray(np.abs(calibration.at_limits[name]).sum(axis=1))
 
 
-def _shaped(values: Values) -> dict[str, Any]:
-    return {"bias": values[:3].tolist(), "matrix": matrix_of(values).tolist()}
-
-
 def both_figures(part: Mapping[str, Any] | None) -> dict[str, tuple[float, float]]:
     """Return U without and with the open effects, of each parameter of bias and matrix where they differ by over 10 %.
 
@@ -201,10 +197,7 @@ def implausible(rows: Sequence[LimitRow]) -> list[Entry]:
 
 
 def beyond_limits(rows: Sequence[LimitRow]) -> list[Entry]:
-    """Return the fitted parameters of ``limited`` whose absolute value exceeds the limit, the largest ratio first.
-
-    An entry has ``parameter``, ``value``, ``unit``, ``limit`` and ``ratio``.
-    """
+    """Return as ``implausible``, without a cause, the parameters beyond the limit, the largest ratio first."""
     return [_entry(row) for row in rows if abs(row[1]) > row[4]]
 
 
@@ -267,7 +260,6 @@ def limited_effects(sensor: str, part: Mapping[str, Any], limits: Mapping[str, f
 
 
 def _scale_cause(sensor: str, factors: np.ndarray) -> str:
-    """Return the likely cause of scale factors far from 1."""
     mean = float(np.mean(factors))
     if np.ptp(factors) > EQUAL_SPREAD * mean:
         return "another column, counts per unit or axis map of this axis, or a damaged axis"

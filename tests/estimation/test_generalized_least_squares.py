@@ -163,17 +163,9 @@ def test_turns_about_one_axis_do_not_determine_the_matrix() -> None:
         fit_joint("accelerometer", one, [], None, SETTINGS)
 
 
-@pytest.mark.parametrize(
-    ("names", "message"),
-    [
-        (["g_sensitivity"], "is an effect of the gyroscope alone"),
-        (["lever_arm", "lever_arm"], "names an effect twice"),
-        (["lever_arm", "inner_lever_arms"], "which it contains"),
-    ],
-)
-def test_a_list_that_makes_no_sense_is_refused(names: list[str], message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        fit_joint("accelerometer", record(Session(1)), names, None, SETTINGS)
+def test_an_effect_that_is_named_twice_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="names an effect twice"):
+        fit_joint("accelerometer", record(Session(1)), ["lever_arm", "lever_arm"], None, SETTINGS)
 
 
 def test_products_under_wander_are_those_of_the_whole_covariance() -> None:

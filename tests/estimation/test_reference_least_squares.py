@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from table_turns import Bench, run_stages, settings, specific_force
+from table_turns import Bench, run_stages, settings
 from unit_settings import filter_of
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError
@@ -85,20 +85,6 @@ def test_a_filter_on_the_readings_changes_neither_scale_nor_misalignment(applied
         bench = Bench(**parameters)
         filtered = [apply_filter(r, applied) for r in recordings(bench)]
         assert_exact(calibrate(bench.sensor, filtered), bench, 1e-9)
-
-
-def test_a_filter_that_cannot_be_rebuilt_leaves_the_shift_by_its_delay() -> None:
-    bench = Bench(**ACCELEROMETER)
-    delay = 0.2
-    late = []
-    for recording in bench.continuous(30.0, stop=720.0):
-        force = specific_force(recording.axis, recording.table_angle - 30.0 * delay)
-        label = {"name": "analog", "delay_s": delay, "noise_gain": 1.0}
-        late.append(replace(recording, accelerometer=bench.reading(force), filter=label))
-    unit = UnitRecordings(late, {"accelerometer": None})
-    assert_exact(fit(StageInput("accelerometer", unit, None, settings())), bench, 1e-9)
-    unaware = [replace(r, filter={"name": "none", "delay_s": 0.0, "noise_gain": 1.0}) for r in late]
-    assert np.max(np.abs(calibrate("accelerometer", unaware).matrix - MATRIX)) > 0.05
 
 
 def test_only_settled_rests_count_where_the_table_stops_and_goes() -> None:

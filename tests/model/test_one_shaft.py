@@ -18,7 +18,7 @@ def test_earth_turns_as_seen_from_a_body_on_a_shaft(axis: str, sense: int) -> No
     angle = 40.0 * np.sin(0.8 * time)
     recording = Recording("turn", "gyroscope", axis, np.arange(400) * 50_000_000, table_angle=angle, sense=sense)
     earth = earth_rate(LATITUDE, AZIMUTH)
-    with_earth = reference_motion(recording, earth_rate_level=earth, one_shaft=True)
+    with_earth = reference_motion(recording, earth=tuple(earth.tolist()), one_shaft=True)
     without = reference_motion(recording)
     assert with_earth is not None
     assert without is not None

@@ -251,12 +251,10 @@ def test_a_file_that_unfolds_without_end_is_refused(tmp_path: Path) -> None:
         read_effect_file(file)
 
 
-def test_registered_effects_stand_beside_the_built_in_ones_and_never_for_one() -> None:
+def test_registered_effects_stand_beside_the_built_in_ones() -> None:
     register_user_effects(UserEffectFiles(formulas=[read(GEAR)], python=[]))
     assert list(catalogue()) == [*built_in(), "gear_mesh"]
     assert effect("gear_mesh").definition == read(GEAR)
-    with pytest.raises(ConfigurationError, match="a built-in effect has this name"):
-        register(effect("warm_up"))
 
 
 def calibration(definition: dict[str, Any]) -> SensorCalibration:

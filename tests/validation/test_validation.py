@@ -317,7 +317,7 @@ def test_the_rate_is_that_of_the_attitude_where_only_that_is_logged() -> None:
 def test_earths_rotation_is_in_the_reference_where_it_is_configured() -> None:
     settings = settings_of(SETTINGS, table={"gravity_g": 1.0, "latitude_deg": 13.7, "azimuth_deg": 30.0})
     c, recording = calibration("gyroscope"), held_out(1000, calm=10.0)
-    motion = reference_motion(recording, 1.0, earth_rate(13.7, 30.0))
+    motion = reference_motion(recording, 1.0, tuple(earth_rate(13.7, 30.0).tolist()))
     recording = replace(recording, gyroscope=predicted_reading(c, motion))
     part = validate(c, [recording], noise_of("gyroscope"), settings)
     assert part["steps"][-1]["rms_error"] < 1e-9

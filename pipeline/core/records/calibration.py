@@ -398,10 +398,10 @@ class SensorCalibration:
             "unit": SENSOR_UNITS[self.sensor],
             "bias": self.bias.tolist(),
             "matrix": self.matrix.tolist(),
-            "standard_uncertainty": _shaped(standard),
-            "expanded_uncertainty": _shaped(factors * standard),
-            "determined_by": _shaped(np.where(self.by_limit, "sensor_file", "recordings")),
-            "coverage_factor": _shaped(factors),
+            "standard_uncertainty": shaped(standard),
+            "expanded_uncertainty": shaped(factors * standard),
+            "determined_by": shaped(np.where(self.by_limit, "sensor_file", "recordings")),
+            "coverage_factor": shaped(factors),
             "degrees_of_freedom": self.degrees_of_freedom if np.isfinite(self.degrees_of_freedom) else None,
             "effective_degrees_of_freedom": finite(parameters.degrees_of_freedom),
             "covariance": {"parameters": list(parameters.names), "values": parameters.covariance.tolist()},
@@ -459,6 +459,6 @@ def calibrated(fits: Mapping[str, Fit]) -> dict[str, SensorCalibration | None]:
     return {sensor: None if isinstance(fit, NotCalibrated) else fit for sensor, fit in fits.items()}
 
 
-def _shaped(values: NDArray[Any]) -> dict[str, Any]:
+def shaped(values: NDArray[Any]) -> dict[str, Any]:
     """Return values of all parameters in the shapes of bias and matrix."""
     return {"bias": values[BIAS].tolist(), "matrix": matrix_of(values).tolist()}

@@ -355,8 +355,8 @@ class Motion:
     rate: Values | None  # (n,), deg/s
     axis: int | None  # of the turn
     still: Mask  # (n,), samples at rest, after settling
-    at_offset: Callable[..., Motion | None] | None = None
-    at_lag: Callable[..., Motion | None] | None = None
+    at_offset: Callable[..., Motion] | None = None
+    at_lag: Callable[..., Motion] | None = None
     level: Values | None = None  # (n, 3, 3), rows: axes of the level frame in the body frame; None: unknown heading
     # (n, 3), unit vector of the current turn or, at rest, of the last turn; zeros before the first turn. None: not
     # computed yet (pipeline.physics.effects.base.turning_direction).
@@ -409,17 +409,16 @@ def motion_at_rest(time: NDArray[np.float64]) -> Motion:
     return Motion(time, zeros, zeros, zeros, zeros, None, None, None, None, still)
 
 
-def ends_of_runs(mask: Mask) -> tuple[Index, Index]:
-    """Return where the runs of True in a mask start and stop."""
-    padded = np.zeros(len(mask) + 2, bool)
-    padded[1:-1] = mask
-    edges = np.flatnonzero(padded[1:] != padded[:-1])
-    return edges[::2], edges[1::2]
-
-
 def finite_rows(values: Values) -> Mask:
     """Return whether each row of (n, k) values is finite: (n,); column by column, in a sixth of the time."""
     return np.asarray(np.isfinite(values, order="F").all(axis=1))
+
+
+def runs_of(mask: Mask) -> Index:
+    """Return start and stop of each run of True in a mask: (k, 2) array."""
+    padded = np.zeros(len(mask) + 2, bool)
+    padded[1:-1] = mask
+    return np.flatnonzero(padded[1:] != padded[:-1]).reshape(-1, 2)
 
 
 def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -115,7 +115,6 @@ class _Solved:
 
     @property
     def rows(self) -> slice:
-        """The m rows."""
         return slice(self.model.rests_equations)
 
     @property
@@ -130,7 +129,6 @@ class _Solved:
 
     @property
     def spare(self) -> int:
-        """Rows and pseudo-observations minus parameters."""
         return len(self.residual) - len(PARAMETER_NAMES)
 
     @property
@@ -275,7 +273,7 @@ def _fit_partly(rows: Orientations, gravity_g: float, prior: WanderPrior, data_s
         solved = _fitted(rows, gravity_g, prior, held, partly=True)
         return solved, solved.uncertainty
 
-    return with_limits(dict(zip(PARAMETERS, limits_of_parameters(data_sheet).tolist(), strict=True)), solve_with)
+    return with_limits(limits_of_parameters(data_sheet), solve_with)
 
 
 def _unused(rows: Orientations) -> str:

@@ -210,11 +210,6 @@ def fit_sinusoid(angle_deg: Values, reading: Values, *, sides: bool, where: str)
     return Sinusoid(coefficients, columns, factors.weights(), reading - columns @ coefficients, factors.condition)
 
 
-def wrap(angle_deg: Values) -> Values:
-    """Return angles in [-180, 180) deg."""
-    return (angle_deg + 180.0) % 360.0 - 180.0
-
-
 def _factors(columns: Values, where: str) -> ScaledColumns:
     n, p = columns.shape
     if n >= p:
@@ -302,7 +297,8 @@ def orthogonality(extremes: Extremes) -> EstimatedSteps:
         return np.array([b * c, a * c, a * b] if extremes.as_printed else [1.0, c, a * b])
 
     angles = {"P": extremes.angle_high, "N": extremes.angle_low}
-    excess = {side: wrap(angle[:, 0] - angle[:, 1] - 90.0) for side, angle in angles.items()}
+    # within [-180, 180) deg
+    excess = {side: (angle[:, 0] - angle[:, 1] - 90.0 + 180.0) % 360.0 - 180.0 for side, angle in angles.items()}
     positive, negative = factors(excess["P"]), factors(excess["N"])
     switch_at = np.zeros(3) if extremes.as_printed else extremes.a_zero
     values = _per_axis("O_P", positive, "1") | _per_axis("O_N", negative, "1")
@@ -418,10 +414,7 @@ class CorrectedForces:
 
 
 def follow(extremes: Extremes, names: Sequence[str], start: CorrectedForces | None = None) -> CorrectedForces:
-    """Run stages one after the other, each on the output of the one before.
-
-    ``start``: output of the stage before the first.
-    """
+    """Run stages one after the other, each on the output of the one before; ``start``: output before the first."""
     found = start or CorrectedForces()
     for step in found.steps:
         extremes = extremes.corrected(step)

@@ -1,4 +1,1 @@
-"""Calibration of the gyroscope: each module is one stage of a fit.
-
-Importing one does not import the others, so that a job pays only for its own stage.
-"""
+"""Calibration of the gyroscope: each module is one stage of a fit, and a job imports its own stage alone."""

@@ -126,10 +126,7 @@ def forward_of(recordings: Sequence[Recording], bias: Values, table: Table) -> F
 
 
 def fit(task: StageInput) -> SensorCalibration:
-    """Fit the matrix of the gyroscope to integrated turns (``pipeline.estimation.stages``).
-
-    Role ``gyroscope``, on a table, after the stage ``bias``.
-    """
+    """Fit the matrix to the integrated turns of role ``gyroscope``, on a table, after the stage ``bias``."""
     recordings, previous, settings, prior = task.recordings, task.previous, task.settings, task.prior
     assert previous is not None  # noqa: S101  (it needs the bias: FIT_STAGES)
     if settings.procedure.sheet is not None:
@@ -336,10 +333,7 @@ def _moves(part: TurnPart) -> list[tuple[int, int]]:
 
 
 def require_turns(U: Values) -> None:
-    """Raise ``NotObservableError`` if the turns do not span all three axes.
-
-    ``U``: (t, 3), deg, angle of each turn about each axis.
-    """
+    """Raise ``NotObservableError`` if turns by U, (t, 3) deg about each axis, do not span all three axes."""
     total = np.sqrt(np.sum(U**2, axis=0))
     largest = float(total.max(initial=0.0))
     missing = [axis for axis, angle in zip(AXES, total, strict=True) if angle <= 1e-3 * largest or largest == 0.0]

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.core.errors import ConfigurationError, NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.core.records import (
     AFTER_BASE,
     AXES,
@@ -50,6 +50,7 @@ from pipeline.estimation.stages import FitStage, StageInput, details_on_table
 from pipeline.estimation.table_errors import Reference, noise_on_table
 from pipeline.estimation.turns import TurnPart, blocks_of_samples, parts_of, steady_turns, used_motions
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
+from pipeline.physics.signal.filters import filter_autocovariance
 from pipeline.physics.signal.rests import runs
 
 EstimatedStep = tuple[Subtract | Multiply, dict[str, tuple[float, str]]]
@@ -57,7 +58,6 @@ EstimatedStep = tuple[Subtract | Multiply, dict[str, tuple[float, str]]]
 # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
 DIFFERENCE_STEP_DPS = 1e-5
 FORGOTTEN_RATE_CHANGE = 1e-5  # share of a change of rate in a filter's output, below which the filter has settled
-KNOWN_DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alone
 FIT_STAGES = {
     "bias": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("bias",)),
     "orthogonality_and_misalignment": FitStage(sensors=("gyroscope",), accepts=("readings",), changes=("matrix",)),
@@ -136,10 +136,7 @@ class CorrectedRates:
 
 
 def follow(response: Response, names: Sequence[str], start: Sequence[CorrectionStep] = ()) -> CorrectedRates:
-    """Run stages one after the other, each on the output of the one before.
-
-    ``start``: the correction by the stages before the first of ``names``.
-    """
+    """Run stages one after the other, each on the output of the one before; ``start``: the correction so far."""
     found = CorrectedRates([*start])
     for step in found.steps:
         response = response.after(step)
@@ -169,10 +166,7 @@ def estimates_of(recordings: Sequence[Recording], settings: Settings) -> Estimat
 
 
 def fit(task: StageInput) -> SensorCalibration:
-    """Run one stage of the staged method (``pipeline.estimation.stages``).
-
-    Role ``gyroscope``, on a table; also role ``static`` if these recordings hold no rest.
-    """
+    """Run one stage of the staged method; role ``gyroscope``, on a table, also ``static`` if these hold no rest."""
     name, recordings, previous, settings = task.stage, task.recordings, task.previous, task.settings
     if settings.procedure.sheet is not None and name == "bias":
         from pipeline.estimation.gyroscope.cholesky_lu import fit_bias  # noqa: PLC0415  (only for turns of a sheet)
@@ -276,15 +270,9 @@ def samples_of(parts: Sequence[TurnPart], recordings: Sequence[Recording]) -> Tu
 
 def _memory(recording: Recording) -> float:
     """Return the settling time of the recording's filter, s."""
-    applied = recording.filter
-    if applied["name"] == "none":
+    if recording.filter["name"] == "none":
         return 0.0
-    try:
-        from pipeline.physics.signal.filters import filter_autocovariance  # noqa: PLC0415  (needed for filtered recordings only)
-
-        covariance = np.abs(filter_autocovariance(recording))
-    except (ConfigurationError, KeyError):
-        return KNOWN_DELAYS_TO_SETTLE * float(applied["delay_s"])
+    covariance = np.abs(filter_autocovariance(recording))
     return float(np.flatnonzero(covariance > FORGOTTEN_RATE_CHANGE * covariance[0])[-1] + 1) * recording.interval
 
 

@@ -269,15 +269,12 @@ def white_of(rests: Rests, noise: Noise | None) -> Values:
     return rests.white
 
 
-def limits_of_parameters(data_sheet: DataSheet) -> Values:
-    """Return u of each of ``PARAMETERS`` by the sensor file's limits: (9,) array.
-
-    ``data_sheet``: of the accelerometer.
-    """
+def limits_of_parameters(data_sheet: DataSheet) -> dict[str, float]:
+    """Return u of each of ``PARAMETERS`` by the sensor file's limits; ``data_sheet``: of the accelerometer."""
     uniform = {"bias": data_sheet.bias, "scale_factor": data_sheet.scale_factor}
-    angle = limit_of_misalignment(data_sheet)
-    limits = [uniform.get(name[:-2]) for name in PARAMETERS]
-    return np.array([angle if limit is None else limit / np.sqrt(3.0) for limit in limits])
+    limits = {kind: float(limit / np.sqrt(3.0)) for kind, limit in uniform.items()}
+    limits["misalignment"] = limit_of_misalignment(data_sheet)
+    return {name: limits[name.rpartition("_")[0]] for name in PARAMETERS}
 
 
 def limit_of_misalignment(data_sheet: DataSheet) -> float:
@@ -298,10 +295,7 @@ def _directions(calibration: SensorCalibration) -> Values:
 def model_of(
     recordings: Sequence[Recording], calibration: SensorCalibration, noise: Noise | None, settings: Settings
 ) -> AccelerometerModel | None:
-    """Return the model of the recordings' rests, or None if there are none.
-
-    ``calibration``: of the accelerometer's method.
-    """
+    """Return the model of the recordings' rests, or None if there are none; ``calibration``: of the method."""
     rests = rests_of("accelerometer", recordings, settings.procedure, calibration)
     if rests is None:
         return None

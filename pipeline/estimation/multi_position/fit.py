@@ -329,9 +329,7 @@ class FitByHand:
 
     @cached_property
     def _weight(self) -> Values:
-        restricted = np.array([solved.restricted for solved in self._every[1]])
-        weight = np.exp(restricted - restricted.max())
-        return np.asarray(weight / weight.sum())
+        return np.asarray(scipy.special.softmax([solved.restricted for solved in self._every[1]]))
 
     @cached_property
     def _averaged(self) -> tuple[Values, Values]:

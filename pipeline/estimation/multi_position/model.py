@@ -294,10 +294,7 @@ def motion_at_rests(rests: Rests, force: Values) -> Motion:
 
 
 def motion_of(part: Rests | Moves | TurnsByHand, force: Values, rate: Values, *, still: bool) -> Motion:
-    """Return the motion of rests, or of the samples of moves or turns, by calibrated signals (n, 3).
-
-    Derivatives of the motion are zero.
-    """
+    """Return the motion, without derivatives, at rests or samples of moves or turns by calibrated signals (n, 3)."""
     time, temperature, warming = (values.ravel() for values in (part.time, part.temperature, part.temperature_rate))
     known: dict[str, Any] = {"specific_force": force, "angular_rate": rate, "direction": np.zeros_like(force)}
     if not np.isnan(temperature).any():
@@ -325,10 +322,9 @@ def selection_hypotheses(noise: Noise | None, kinds: int) -> list[NoiseHypothesi
 
 
 def prior_hypotheses(prior: WanderPrior, white: float, kinds: int) -> list[NoiseHypothesis]:
-    """Return the hypotheses over which a covariance is averaged.
+    """Return the hypotheses over which a covariance is averaged; ``prior``: of the bias instability.
 
-    ``prior``: of the bias instability. ``white``: white noise of a sample, unit of the sensor. ``kinds``: number of
-    kinds of scatter.
+    ``white``: white noise of a sample, unit of the sensor. ``kinds``: number of kinds of scatter.
     """
     steps = prior.wander * INSTABILITY_FACTORS if prior.wander > 0.0 else white * np.array(INSTABILITY_RATIOS)
     bias = np.append(0.0, steps)

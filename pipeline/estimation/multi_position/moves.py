@@ -234,10 +234,7 @@ def sound_span(recording: Recording, span: slice, longest: float = MAX_MOVE_S) -
 
 
 def to_the_end(rate: Values, time: Values) -> Values:
-    """Return A_k for every sample of every move: (k, s, 3, 3) array.
-
-    ``rate``: (k, s, 3), deg/s. ``time``: (k, s), s.
-    """
+    """Return A_k of every sample of every move, (k, s, 3, 3), by rates (k, s, 3), deg/s, and times (k, s), s."""
     omega, dt = np.radians(rate), np.diff(time, axis=1)[:, :, None]
     phi = 0.5 * (omega[:, 1:] + omega[:, :-1]) * dt + np.cross(omega[:, :-1], omega[:, 1:]) * dt**2 / 12.0
     k, n = phi.shape[:2]

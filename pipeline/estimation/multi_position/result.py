@@ -38,7 +38,7 @@ from pipeline.estimation.multi_position.fit import FitByHand, fit
 from pipeline.estimation.multi_position.model import Model, State, prior_hypotheses, stepped
 from pipeline.estimation.noise import wander_prior
 from pipeline.estimation.rest_means import rests_of
-from pipeline.estimation.stages import is_given, unknown_uncertainty
+from pipeline.estimation.stages import unknown_uncertainty
 from pipeline.estimation.uncertainty_budget import (
     TEMPERATURE,
     base_parameters,
@@ -131,8 +131,7 @@ def after_stage(
     stated, unstated = (gravity_line if sensor == "accelerometer" else clock_line)(calibration, table)
     lines, missing = lines + stated, missing | unstated
     if sensor == "gyroscope":
-        if is_given("accelerometer", settings.method):
-            missing |= unknown_uncertainty("accelerometer", settings.method)
+        missing |= unknown_uncertainty("accelerometer", settings.method)
         missing["Earth's rotation"] = "not in the model: by hand the heading is unknown; up to 0.0042 deg/s of bias"
     complete, trials = combined(calibration, [*lines, *limit], missing), settings.uncertainty.monte_carlo
     return _with_monte_carlo(complete, model, fitted, trials, lines[1:]) if trials else complete

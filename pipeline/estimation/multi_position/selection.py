@@ -143,7 +143,6 @@ class SelectionByHand:
         return {name: self._without(name) for name in self.names}
 
     def _search(self) -> None:
-        """Select from the candidates."""
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
         self.fit = self.base

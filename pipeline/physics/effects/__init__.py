@@ -72,20 +72,12 @@ def leaving_out(names: Iterable[str]) -> Iterator[None]:
 
 
 def register(effect: Effect) -> None:
-    """Add a user's effect to the catalogue of this process; it replaces one of the same name.
-
-    Raises ``ConfigurationError`` if a built-in effect has that name.
-    """
-    if effect.name in built_in_files():
-        raise ConfigurationError(f"effect {effect.name}: a built-in effect has this name; choose another name")
+    """Add a user's effect to the catalogue of this process; it replaces one of the same name, which is not built in."""
     _registered[effect.name] = effect
 
 
 def register_user_effects(files: UserEffectFiles) -> None:
-    """Register the effects of a job's configuration.
-
-    Raises ``ConfigurationError`` if one is faulty.
-    """
+    """Register the effects of a job's configuration; raise ``ConfigurationError`` if one is faulty."""
     for definition in files.formulas:
         register(effect_from(definition, f"effect {definition.get('name')} of the campaign"))
     for entry in files.python:
@@ -117,10 +109,7 @@ def fitted_effect(name: str, sensor: str, values: Values) -> FittedEffect:
 
 
 def effect(name: str) -> Effect:
-    """Return one effect by name; ``<effect>@<setup>`` acts in one session (``pipeline.physics.effects.mounting``).
-
-    Raises ``ConfigurationError`` if there is none of that name.
-    """
+    """Return an effect by name; ``<effect>@<setup>`` acts in one session. ``ConfigurationError`` if there is none."""
     if name in _registered:
         return _registered[name]
     if name in built_in_files():
@@ -178,10 +167,7 @@ def built_in_files() -> dict[str, Path]:
 
 
 def read_effect_files(files: Iterable[Path]) -> dict[str, Effect]:
-    """Read the effects of YAML files, by name.
-
-    Raises ``ConfigurationError`` with a line for each faulty file.
-    """
+    """Read the effects of YAML files, by name; raise ``ConfigurationError`` with a line for each faulty file."""
     found: dict[str, Effect] = {}
     problems = []
     for file in files:
@@ -195,10 +181,7 @@ def read_effect_files(files: Iterable[Path]) -> dict[str, Effect]:
 
 
 def read_effect_file(file: Path, *, built_in: bool = False) -> Effect:
-    """Read the effect of one YAML file.
-
-    Raises ``ConfigurationError`` with the faulty line.
-    """
+    """Read the effect of one YAML file; raise ``ConfigurationError`` with the faulty line."""
     text = read_text(file, MAX_EFFECT_BYTES, "an effect")
     given = load_yaml(text, str(file), MAX_EFFECT_VALUES)
     if not isinstance(given, dict):

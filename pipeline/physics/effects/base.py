@@ -246,10 +246,7 @@ def turning_direction(motion: Motion) -> Values:
 
 
 def per_axis(regressors: Values) -> Values:
-    """Spread (n, 3, q) regressors, q coefficients an axis, to (n, 3, 3 q) columns.
-
-    Parameter order: all of x, then y, then z.
-    """
+    """Spread (n, 3, q) regressors, q coefficients an axis, to (n, 3, 3 q) columns: all of x, then y, then z."""
     n, _, q = regressors.shape
     out = np.zeros((n, 3, 3, q))
     out[:, [0, 1, 2], [0, 1, 2], :] = regressors

@@ -118,14 +118,12 @@ class _OfTurns(DeclaredEffect):
     each = 2
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the columns of the turn axis, zeros for the others."""
         out = np.zeros((len(motion.time), 3, 3 * self.each))
         for parameter, column in self._columns(sensor, motion, K):
             out[:, :, parameter] = column
         return out
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the sum of the columns of the turn axis."""
         added = np.zeros((len(motion.time), 3))
         for parameter, column in self._columns(sensor, motion, K):
             added += column * values[parameter]
@@ -258,10 +256,7 @@ class WarmUp(DeclaredEffect):
 
 
 def shifted(motion: Motion, offset: float | Values) -> Motion:
-    """Return the motion at ``time + offset``, s: a float or (n,) array.
-
-    Without a trajectory between the samples the truth is extrapolated linearly.
-    """
+    """Return the motion at ``time + offset``, s, a float or (n,) array; without a trajectory by a straight line."""
     if not np.any(offset):
         return motion
     if motion.at_offset is not None:
@@ -274,9 +269,8 @@ def shifted(motion: Motion, offset: float | Values) -> Motion:
     )
 
 
-def _seen_from(motion: Motion, moved: Motion | None) -> Motion:
+def _seen_from(motion: Motion, moved: Motion) -> Motion:
     """Return a moved motion with the rests and directions of the logged motion."""
-    assert moved is not None  # noqa: S101
     return moved.changed(still=motion.still, direction=motion.direction)
 
 

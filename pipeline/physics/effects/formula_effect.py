@@ -49,10 +49,6 @@ from pipeline.physics.formula import OF_THE_MOTION, SIGNALS, Formula, c_number, 
 
 MotionSignals: TypeAlias = "Mapping[str, Values | None]"  # None: the recording has no turn axis
 
-AS_DECLARED = (
-    *("name", "owner", "sensors", "contains", "prior", "needs_both_directions", "meaning", "excitation", "experiment"),
-    *("experiment_by_hand", "source", "typical_share", "proposed", "shown_by", "scales_with"),
-)
 OF_THE_TURN = ("angle", "rate")
 OPTIONAL_FIELDS = ("temperature", "angle", "rate", "level")  # fields that a motion may lack
 TRUTHS = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
@@ -67,14 +63,11 @@ REQUIRED = ("name", "owner", "sensors", "meaning")
 
 
 class DeclaredEffect(Effect):
-    """An effect with name, owner, parameters and texts from a file; a subclass has its equation.
-
-    ``definition``: the content of the file of a user's effect.
-    """
+    """An effect by a file, whose equation a subclass has; ``definition``: the content of a user's file."""
 
     def __init__(self, declared: Declaration, definition: dict[str, Any] | None = None) -> None:
         self.declared, self.definition = declared, definition
-        for name in AS_DECLARED:
+        for name in Effect.__annotations__.keys() & Declaration.__annotations__.keys():
             setattr(self, name, getattr(declared, name))
         self._parameters = {sensor: declared.parameters_of(sensor) for sensor in declared.sensors}
 

@@ -82,9 +82,8 @@ def turned_back(values: Values) -> Values:
     return np.asarray(np.swapaxes(turn_by_vector(np.radians(values)), -1, -2))
 
 
-def _rotated_at(trajectory: Callable[..., Motion | None], rotation: Values, **at: Any) -> Motion | None:  # noqa: ANN401
-    there = trajectory(**at)
-    return there and rotated(there, rotation)
+def _rotated_at(trajectory: Callable[..., Motion], rotation: Values, **at: Any) -> Motion:  # noqa: ANN401
+    return rotated(trajectory(**at), rotation)
 
 
 class _OfRecordings(DeclaredEffect):
@@ -97,7 +96,6 @@ class _OfRecordings(DeclaredEffect):
     what: str
 
     def of_recordings(self, setups: Mapping[str, str]) -> Self:
-        """Return the effect with parameters for these recordings, name to setup."""
         bound = copy(self)
         bound.recordings = tuple(dict.fromkeys(self.owner_of(*pair) for pair in setups.items()))
         bound.definition = {"name": self.name, "recordings": list(bound.recordings)}
@@ -108,7 +106,6 @@ class _OfRecordings(DeclaredEffect):
         return recording
 
     def covers(self, motion: Motion) -> bool:
-        """Return whether there are parameters for the recording of a motion."""
         return self.owner_of(motion.recording, motion.setup) in self.recordings
 
     def parameters(self, sensor: str) -> tuple[EffectParameter, ...]:
@@ -220,7 +217,6 @@ class _Mounting(Effect):
         return tuple(EffectParameter(f"theta_{a}", "deg", f"turn of the unit, its part about body {a}") for a in "xyz")
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the derivative by central differences."""
         return rotation_columns(sensor, motion, K, turned_back, values)
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
@@ -262,12 +258,10 @@ class _InSession(Effect):
         return self.base.parameters(sensor)
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the regressors of the effect in its session, zeros elsewhere."""
         found = self.base.regressors(sensor, motion, K, values)
         return found if motion.setup == self.session else np.zeros_like(found)
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the reading of the effect in its session, zeros elsewhere."""
         if motion.setup == self.session:
             return self.base.reading(sensor, motion, K, values)
         return np.zeros((len(motion.time), 3))
@@ -275,10 +269,7 @@ class _InSession(Effect):
 
 @cache
 def in_session(name: str, base: Effect) -> Effect:
-    """Return the effect ``<base>@<session>``.
-
-    Raises ``ConfigurationError`` if the effect moves the motion in time, or is not linear in its parameters.
-    """
+    """Return ``<base>@<session>``; raise ``ConfigurationError`` if the effect moves in time or is not linear."""
     if base.moves or base.nonlinear:
         raise ConfigurationError(
             f"effect {name}: {base.name} cannot be one setup's own, as the fit is not linear in it; name {base.name}"

@@ -32,11 +32,10 @@ Wahba, Annals of Statistics 13 (1985), 1378, for a noise of known variance.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from math import factorial
 from typing import NamedTuple
 
@@ -167,7 +166,7 @@ def _smoothed(time: Values, angle: Values, step: float, error: float) -> Encoder
     ).tolist()  # first samples after a gap
     ends = [[first, *(i for i in apart if first < i < last), last] for first, last in runs(moving)]
     vague = np.zeros(n, bool)
-    for first, last in itertools.chain.from_iterable(map(itertools.pairwise, ends)):
+    for first, last in chain.from_iterable(map(pairwise, ends)):
         before, after = first in apart, last in apart
         around = slice(first if before else max(first - ADDED_REST, 0), last if after else min(last + ADDED_REST, n))
         ending = max(last - ADDED_REST * after, first)
@@ -211,8 +210,6 @@ def _stretch(time: Values, angle: Values, error: float) -> tuple[Values, float]:
 
 
 class _Smoother:
-    """The smoothing of an angle for one order of difference."""
-
     def __init__(self, time: Values, angle: Values, variance: float, order: int) -> None:
         self.angle, self.variance, self.order = angle, variance, order
         n = len(time)

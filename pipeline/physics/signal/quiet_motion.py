@@ -309,10 +309,7 @@ def windows(values: Values, size: int) -> tuple[Values, Values]:
 
 
 def _references(medians: Values, ends: Values) -> tuple[Values, Mask]:
-    """Return the rate at rest of each stretch, and which stretches are mostly rest.
-
-    ``ends``: means of the first and last window of each stretch, (m, 2, 3).
-    """
+    """Return the rate at rest of each stretch, and which are mostly rest; ``ends``: means of end windows, (m, 2, 3)."""
     out, resting = medians.copy(), np.ones(len(medians), bool)
     if len(medians) <= 2:
         middle = ends.mean(axis=1)

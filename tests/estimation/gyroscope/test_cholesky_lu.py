@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from bench_session import gauss_markov
-from unit_settings import settings_of, with_noise
+from unit_settings import filter_of, settings_of, with_noise
 
 from pipeline.core.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.core.records import Recording, SensorCalibration, UnitRecordings, coverage_factor
@@ -188,10 +188,11 @@ def test_the_uncertainty_of_the_factors_is_the_scatter_of_their_repeats() -> Non
 
 def test_a_delay_of_the_readings_hardly_matters_to_integrated_turns() -> None:
     delayed = []
+    applied = {**filter_of("rc_low_pass", time_constant_s=0.24).json_value, "delay_s": 0.24}
     for recording in _campaign():
         reading = np.asarray(recording.gyroscope)
         late = np.concatenate([reading[:2], reading[:-2]])  # 0.24 s: 5 deg at 20 deg/s
-        delayed.append(dataclasses.replace(recording, gyroscope=late, filter={"name": "rc_low_pass", "delay_s": 0.24}))
+        delayed.append(dataclasses.replace(recording, gyroscope=late, filter=applied))
     unit = UnitRecordings(delayed, {"gyroscope": None})
     found = fit(StageInput("gyroscope", unit, fit_stage("gyroscope", "bias", unit, None, SETTINGS), SETTINGS))
     assert found.matrix @ FORWARD == pytest.approx(np.eye(3), abs=1e-9)
