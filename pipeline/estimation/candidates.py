@@ -8,7 +8,7 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from pipeline.core.errors import ConfigurationError, NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.core.records import Motion, Recording, SensorCalibration, Values, standard_uncertainty
 from pipeline.core.settings import DataSheet, Settings, Table
 from pipeline.estimation.design import EffectColumns, NormalPrior, Terms, placed
@@ -65,13 +65,11 @@ def starts_of(
     """Return the terms from which a fit starts, every combination of the effects' starts.
 
     ``observed``: for recordings by hand only the sensor. ``known``: a calibration, at whose effects a fit starts.
-    ``accelerometer``, for the gyroscope: its mountings. Raises ``ConfigurationError`` if an effect is unknown or named
-    twice; the configuration has no effect of the other sensor alone, and none beside one that contains it.
+    ``accelerometer``, for the gyroscope: its mountings. Raises ``ConfigurationError`` if an effect is unknown; the
+    configuration names each once, none of the other sensor alone, and none beside one that contains it.
     """
     sensor = observed if isinstance(observed, str) else observed.sensor
     recordings = {} if isinstance(observed, str) else turns_of(observed)
-    if len(set(names)) != len(names):
-        raise ConfigurationError(f"effects.{sensor} names an effect twice: {', '.join(names)}")
     fitted = {} if known is None else {e.name: e.values for e in known.effects}
     choices: list[list[EffectColumns]] = []
     for name in names:

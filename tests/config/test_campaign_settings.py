@@ -107,7 +107,7 @@ def test_everything_that_is_wrong_is_said_in_one_message(tmp_path: Path) -> None
         "U1,stagd,\nU2,,filter.cutof_hz=5\nU3,,filter.cutoff_hz=fast\nU4,,table.gravity_g=9.81\n"
         "U5,,effects.gyroscope=[g_sensitivty]\nU6,,effects.accelerometer=[g_sensitivity]\nU7,,nonsense\n"
         "U8,,filter.cutof_hz=5\nU9,,table.latitude_deg=13\nV1,,batch_size=4\nV2,,method.gyroscope=nonlinear_least_squares\n"
-        'V3,,"effects.accelerometer=[lever_arm,inner_lever_arms]"\n'
+        'V3,,"effects.accelerometer=[lever_arm,inner_lever_arms]"\nV4,,"effects.gyroscope=[g_sensitivity,g_sensitivity]"\n'
     )
     with pytest.raises(ConfigurationError) as refused:
         load(campaign(tmp_path, sheet))
@@ -124,6 +124,7 @@ def test_everything_that_is_wrong_is_said_in_one_message(tmp_path: Path) -> None
         "unit V1: batch_size=4: batch_size is a setting of the run",
         "unit V2: method.gyroscope=nonlinear_least_squares: nonlinear_least_squares has no stages for the gyroscope",
         "unit V3: effects.accelerometer names inner_lever_arms and lever_arm, which it contains: name one",
+        "unit V4: effects.gyroscope names an effect twice: g_sensitivity, g_sensitivity",
     ):
         assert expected in text
 

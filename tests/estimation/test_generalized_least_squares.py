@@ -13,7 +13,7 @@ from unit_settings import settings_of, with_noise
 
 from imu_research.study.cases import draw
 from imu_research.study.run import judge
-from pipeline.core.errors import ConfigurationError, NotObservableError
+from pipeline.core.errors import NotObservableError
 from pipeline.core.records import SensorCalibration
 from pipeline.estimation.design import EffectColumns, ordinary_base
 from pipeline.estimation.effects import fit as fit_effects
@@ -161,11 +161,6 @@ def test_turns_about_one_axis_do_not_determine_the_matrix() -> None:
     one = [r for r in record(Session(1)) if r.axis == "x"]
     with pytest.raises(NotObservableError, match="do not determine column x of the matrix"):
         fit_joint("accelerometer", one, [], None, SETTINGS)
-
-
-def test_an_effect_that_is_named_twice_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="names an effect twice"):
-        fit_joint("accelerometer", record(Session(1)), ["lever_arm", "lever_arm"], None, SETTINGS)
 
 
 def test_products_under_wander_are_those_of_the_whole_covariance() -> None:

@@ -264,6 +264,8 @@ class Composer:
             self._check_limits(sensor, settings.sensor.of(sensor).effects)
             for name in [] if names == "auto" else names:
                 self._check_effect(sensor, name, settings.procedure)
+            if names != "auto" and len(set(names)) < len(names):
+                raise SettingProblem(f"effects.{sensor} names an effect twice: {', '.join(names)}")
             for name in [] if names == "auto" else [*of_bench, *names]:
                 user_effect = self.user_effects.effects.get(name)
                 contains = user_effect.contains if user_effect else read_option("effect", name, ()).get("contains", [])
