@@ -207,8 +207,7 @@ def main() -> None:
                 f"parameters {each.min():5.1f} to {each.max():5.1f} %: {' '.join(f'{e:.1f}' for e in each)}",
                 flush=True,
             )
-    if arguments.figures:
-        write_figures(arguments.figures, figures)
+    write_figures(arguments.figures, figures)
 
 
 if __name__ == "__main__":

@@ -95,8 +95,7 @@ def main() -> int:
             _lay_out(folder, arguments.units, min(arguments.units, arguments.simulated), mixed)
         _run(folder, arguments.cores)
         figures = _report(folder, arguments.cores, ", mixed" * arguments.mixed)
-    if arguments.figures:
-        write_figures(arguments.figures, figures)
+    write_figures(arguments.figures, figures)
     return 0
 
 

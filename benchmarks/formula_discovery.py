@@ -302,8 +302,7 @@ def main() -> None:
         found = share("units with an invented formula", invented, "<= 1 %")
     for figure in found:
         print(*figure.cells)
-    if arguments.figures:
-        write_figures(arguments.figures, found)
+    write_figures(arguments.figures, found)
 
 
 if __name__ == "__main__":

@@ -221,10 +221,9 @@ def main() -> None:
     print("right composition, the others:", interval(sum(short_right), len(short_right)))
     told(covered)
     print("upper limits that hold:", interval(sum(limits), len(limits)))
-    if options.figures:
-        held = [v for (_, enough), values in covered.items() if enough for v in values]
-        shares = share("composition of the noise is right", pd.Series(right), ">= 95 %")
-        write_figures(options.figures, [*shares, *share("intervals that hold the truth", pd.Series(held), ">= 95 %")])
+    held = [v for (_, enough), values in covered.items() if enough for v in values]
+    shares = share("composition of the noise is right", pd.Series(right), ">= 95 %")
+    write_figures(options.figures, [*shares, *share("intervals that hold the truth", pd.Series(held), ">= 95 %")])
     for (expected, got), k in wrong.most_common(15):
         print(f"  {k}: {expected} -> {got}")
 

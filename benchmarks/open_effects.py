@@ -155,8 +155,7 @@ def main() -> None:
             print(f"   {r['sensor']} with {r['effect']}: {said}, line {'yes' if r['line'].any() else 'no'}")
         causes = sorted({(r["sensor"][:4], r["effect"], r["verdict"], ",".join(r["selected"])) for r in told})
         print("   told:", causes if options.told else len(told), flush=True)
-    if options.figures:
-        write_figures(options.figures, figures)
+    write_figures(options.figures, figures)
 
 
 if __name__ == "__main__":

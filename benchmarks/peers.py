@@ -388,8 +388,7 @@ def main() -> None:
     print(text)
     if options.out:
         options.out.write_text(text + "\n")
-    if options.figures:
-        write_figures(options.figures, figures)
+    write_figures(options.figures, figures)
 
 
 if __name__ == "__main__":

@@ -192,8 +192,7 @@ def main() -> None:
                 found += figures_of_set(folder, unit, source.get("authors"))
     for figure in found:
         print(*figure.cells)
-    if options.figures:
-        write_figures(options.figures, found)
+    write_figures(options.figures, found)
 
 
 if __name__ == "__main__":

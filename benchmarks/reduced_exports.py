@@ -140,8 +140,7 @@ def main() -> None:
     )
     far = shown[(over_best > MOST_WORSE) | (over_fit > MOST_WORSE)]
     print(far.sort_values("over_best").to_string(index=False))
-    if options.figures:
-        write_figures(options.figures, figures)
+    write_figures(options.figures, figures)
 
 
 if __name__ == "__main__":

@@ -72,8 +72,7 @@ def main() -> None:
             found = json.loads(Path(folder, "unit", "cost.json").read_text(encoding="utf-8"))
         figures.append(MeasuredFigure(f"{title}: CPU", found["cpu_s"], 1, f"<= {wanted:g}", unit="s"))
         figures.append(MeasuredFigure(f"{title}: largest memory", found["memory_mb"], 1, f"<= {MOST_MB:g}", unit="MB"))
-    if options.figures:
-        write_figures(options.figures, figures)
+    write_figures(options.figures, figures)
 
 
 def _short() -> list[MeasuredFigure]:

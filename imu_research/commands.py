@@ -56,13 +56,7 @@ def study(argv: Sequence[str]) -> int:
     countdown.end()
     cases = cases_of(*(run.read_lines(arguments.directory / name) for name in (run.TRUTH_FILE, run.RESULTS_FILE)))
     found = [*scores.accepted(cases), *scores.family_scores(cases), *scores.answer_scores(cases)]
-    if arguments.figures:
-        stated = [
-            f._replace(name=f"{of}, stated {f.name}")
-            for of in scores.PROBABILITIES
-            for f in scores.reliability(cases, of)
-        ]
-        write_figures(arguments.figures, [*found, *scores.false_selection_rates(cases), *stated])
+    write_figures(arguments.figures, [*found, *scores.false_selection_rates(cases), *scores.stated_shares(cases)])
     for score in found:
         name, n, value, interval, goal = score.cells
         print(f"{name:<92} {n:>5} {value:>8} {interval:<16} {goal:<9} {' '.join(score.misses[:8])}".rstrip())

@@ -108,6 +108,7 @@ def clustered_share(name: str, inside: Sequence[Values], goal: str = "", level: 
     return [MeasuredFigure(name, s, int(sizes.sum()), goal, (max(0.0, s - half), min(1.0, s + half)))]
 
 
-def write_figures(path: Path, figures: Iterable[MeasuredFigure]) -> None:
-    """Write the figures of a command as JSON."""
-    path.write_text(json.dumps([figure.to_json() for figure in figures], indent=1) + "\n", encoding="utf-8")
+def write_figures(path: Path | None, figures: Iterable[MeasuredFigure]) -> None:
+    """Write the figures of a command as JSON; without a path, do nothing."""
+    if path:
+        path.write_text(json.dumps([figure.to_json() for figure in figures], indent=1) + "\n", encoding="utf-8")

@@ -370,6 +370,13 @@ def reliability(cases: Sequence[ScoredCase], of: Probability = "effects") -> lis
     return rows
 
 
+def stated_shares(cases: Sequence[ScoredCase]) -> list[MeasuredFigure]:
+    """Return the bins of ``reliability`` of all probabilities, each with a name that says of what it is."""
+    return [
+        figure._replace(name=f"{of}, stated {figure.name}") for of in PROBABILITIES for figure in reliability(cases, of)
+    ]
+
+
 def reliability_diagram(cases: Sequence[ScoredCase]) -> str:
     """Return a chart of true shares against stated probabilities as an SVG file; empty without probabilities."""
     bins = reliability(cases)

@@ -18,7 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from imu_research.figures import MeasuredFigure, wilson
+
 if TYPE_CHECKING:
+    from collections import Counter
     from pathlib import Path
 
     from unit_copy import Copy, Truth
@@ -77,6 +80,16 @@ def judge(copy: Copy, results: Path) -> list[Judgement]:
         wrong.append(_wrong_rate(copy, results / "exports" / copy.name / "kalibr.yaml"))
         out.append(_calibrated(copy, sensor, found, said, [w for w in wrong if w]))
     return out
+
+
+def shares_of(outcomes: Counter[str]) -> list[MeasuredFigure]:
+    """Return the share of each outcome among the sensors of corrupted units; the goal is that none is silent."""
+    total = outcomes.total()
+    goals = {SILENT: "<= 0 %"}
+    return [
+        MeasuredFigure(f"corrupted: {o}", outcomes[o] / total, total, goals.get(o, ""), wilson(outcomes[o], total))
+        for o in OUTCOMES
+    ]
 
 
 def refused(copy: Copy, message: str) -> list[Judgement]:

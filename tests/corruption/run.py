@@ -22,10 +22,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from all_ways import corrupted, single_ways
 from good_bench import BASES, good_unit
-from judged import OUTCOMES, SILENT, Judgement, judge, refused
+from judged import OUTCOMES, SILENT, Judgement, judge, refused, shares_of
 from unit_copy import TIME, Copy, NotApplicableError, write
 
-from imu_research.figures import MeasuredFigure, wilson, write_figures
+from imu_research.figures import write_figures
 from pipeline.app.config import load_campaign
 from pipeline.core.errors import PipelineError
 
@@ -48,8 +48,7 @@ def main() -> int:
     text = report(judgements, options.seed)
     (out / "table.txt").write_text(text, encoding="utf-8")
     sys.stdout.write(text)
-    if options.figures:
-        write_figures(options.figures, figures(judgements))
+    write_figures(options.figures, shares_of(Counter(j.outcome for j in judgements if not j.harmless)))
     return int(any(j.outcome == SILENT for j in judgements))
 
 
@@ -72,21 +71,6 @@ def parsed() -> argparse.Namespace:
     add("--out", required=True, help="directory for the campaign, its results and the table; replaced")
     add("--figures", type=Path, help="file for the shares with their 95 % intervals")
     return parser.parse_args()
-
-
-def figures(judgements: list[Judgement]) -> list[MeasuredFigure]:
-    """Return the share of each outcome among the sensors of corrupted units; the goal is that none is silent."""
-    found = [j.outcome for j in judgements if not j.harmless]
-    return [
-        MeasuredFigure(
-            f"corrupted: {outcome}",
-            found.count(outcome) / len(found),
-            len(found),
-            "<= 0 %" if outcome == SILENT else "",
-            wilson(found.count(outcome), len(found)),
-        )
-        for outcome in OUTCOMES
-    ]
 
 
 def drawn(options: argparse.Namespace) -> list[Copy]:

@@ -333,8 +333,7 @@ def main(argv: list[str]) -> int:
             for kind in kinds
             for figure in told(kind, pool.map(partial(run, kind=kind, **options), range(arguments.units)))
         ]
-    if arguments.figures:
-        write_figures(arguments.figures, figures)
+    write_figures(arguments.figures, figures)
     return 0
 
 
