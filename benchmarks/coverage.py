@@ -32,6 +32,7 @@ import numpy as np
 
 from imu_research.figures import clustered_share, write_figures
 from pipeline.core.records import SENSORS, NotCalibrated
+from pipeline.output.exports.sensors import rotation_times_lower
 from pipeline.physics.effects.base import truth
 from pipeline.physics.kinematics import reference_motion
 from pipeline.simulation.campaign import simulate_unit
@@ -121,13 +122,6 @@ def noise_free(recordings: list[Recording], sensor: str, hidden: JSON) -> list[R
     return out
 
 
-def frame_of(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation Q of ``matrix = Q L``, L lower triangular: the frame of a fit without a table."""
-    flipped, _ = np.linalg.qr(matrix[:, ::-1])
-    Q = flipped[:, ::-1]
-    return Q * np.sign(np.diag(Q.T @ matrix))
-
-
 def true_values(method: str, recordings: list[Recording], settings: Settings, hidden: JSON) -> np.ndarray:
     _, sensor, stages = METHODS[method]
     matrix = np.array(hidden[sensor]["matrix"])
@@ -138,7 +132,8 @@ def true_values(method: str, recordings: list[Recording], settings: Settings, hi
             APPROXIMATIONS[unit] = np.concatenate([found.bias, found.matrix.ravel()])
         return APPROXIMATIONS[unit]
     if method.endswith("by hand") or "nonlinear" in method:
-        matrix = frame_of(np.array(hidden["accelerometer"]["matrix"])).T @ matrix
+        frame, _ = rotation_times_lower(np.array(hidden["accelerometer"]["matrix"]))  # of a fit without a table
+        matrix = frame.T @ matrix
     return np.concatenate([hidden[sensor]["bias"], matrix.ravel()])
 
 

@@ -13,6 +13,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import StageInput
+from pipeline.output.exports.sensors import rotation_times_lower
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 from tests.published import diagnose
@@ -52,7 +53,8 @@ class Unit:
 
     def true_matrix(self, sensor: str) -> np.ndarray:
         """Return the true matrix in the frame of the calibration: that in which the accelerometer's is triangular."""
-        return frame_of(np.array(self.truth["accelerometer"]["matrix"])).T @ np.array(self.truth[sensor]["matrix"])
+        frame, _ = rotation_times_lower(np.array(self.truth["accelerometer"]["matrix"]))
+        return frame.T @ np.array(self.truth[sensor]["matrix"])
 
 
 @cache
@@ -86,10 +88,3 @@ def hand_held(
     recordings, truth = _simulated(model, seed, procedure, *parts)
     settings = settings_of(sensor=model, table="hand", procedure={"holdout_every": holdout_every})
     return Unit(recordings, truth, settings)
-
-
-def frame_of(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation Q of ``matrix = Q L`` with L lower triangular and positive on its diagonal."""
-    flipped, _ = np.linalg.qr(matrix[:, ::-1])
-    Q = flipped[:, ::-1]
-    return Q * np.sign(np.diag(Q.T @ matrix))
