@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import beta
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "io"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from simulated_logs import as_table, beside_a_table, clock_errors
 
 from pipeline.ingest.clock_alignment import align
