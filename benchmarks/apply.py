@@ -14,13 +14,13 @@ import argparse
 import importlib
 import json
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from measuring import in_own_process
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -115,13 +115,6 @@ def csv_unchanged(log: Path, out: Path, _calibration: Path) -> int:
     return rows
 
 
-def csv_applied(log: Path, out: Path, calibration: Path) -> int:
-    from pipeline.app.field_logs.stream import compensate_log  # noqa: PLC0415
-    from pipeline.physics.compensation import load  # noqa: PLC0415
-
-    return compensate_log(load(calibration), log, out).samples
-
-
 def mcap_unchanged(log: Path, out: Path, _calibration: Path) -> int:
     import zstandard  # noqa: PLC0415
     from mcap.opcode import Opcode  # noqa: PLC0415
@@ -144,7 +137,7 @@ def mcap_unchanged(log: Path, out: Path, _calibration: Path) -> int:
     return reader.count
 
 
-def mcap_applied(log: Path, out: Path, calibration: Path) -> int:
+def applied(log: Path, out: Path, calibration: Path) -> int:
     from pipeline.app.field_logs.stream import compensate_log  # noqa: PLC0415
     from pipeline.physics.compensation import load  # noqa: PLC0415
 
@@ -172,9 +165,9 @@ def mcap_official(log: Path, out: Path, _calibration: Path, most: int = 200_000)
 
 WAYS: dict[str, Callable[[Path, Path, Path], int]] = {
     "csv unchanged": csv_unchanged,
-    "csv applied": csv_applied,
+    "csv applied": applied,
     "mcap unchanged": mcap_unchanged,
-    "mcap applied": mcap_applied,
+    "mcap applied": applied,
     "mcap official": mcap_official,
 }
 MODULES = {
@@ -201,8 +194,7 @@ def run_once(way: str, log: str, out: str, calibration: str) -> None:
 
 
 def measure(way: str, log: Path, out: Path, calibration: Path) -> dict[str, float]:
-    command = [sys.executable, __file__, "--run", way, str(log), str(out), str(calibration)]
-    found: dict[str, float] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    found = in_own_process(__file__, "--run", way, str(log), str(out), str(calibration))
     print(f"{way:16}", ", ".join(f"{key} {value:,.4g}" for key, value in found.items()), flush=True)
     return found
 

@@ -201,7 +201,6 @@ def ends(figure: MeasuredFigure) -> str:
 
 
 def main() -> int:
-    """Run it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "page"))
     parser.add_argument("names", nargs="*", help="measures; all by default")

@@ -274,7 +274,6 @@ def null(number: int, seed: int, depth: str) -> JSON:
 
 
 def main() -> None:
-    """Run what is asked for, and print the shares."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("hidden", "null"))
     parser.add_argument("out", type=Path)

@@ -37,19 +37,8 @@ print(used.ru_utime + used.ru_stime, int(largest) / 1024)
 
 def small(folder: Path, units: int) -> Path:
     """Run a campaign of some units and return its batches."""
-    run = [
-        sys.executable,
-        "-m",
-        "pipeline",
-        "simulate",
-        "small",
-        "--units",
-        str(units),
-        "--samples",
-        "10000",
-        "--quiet",
-    ]
-    subprocess.run(run, cwd=folder, check=True, stderr=subprocess.DEVNULL)
+    made = ["simulate", "small", "--units", str(units), "--samples", "10000", "--quiet"]
+    subprocess.run([sys.executable, "-m", "pipeline", *made], cwd=folder, check=True, stderr=subprocess.DEVNULL)
     command = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "-c2", "-q", "all"]
     subprocess.run([*command, "--config", "campaign=small"], cwd=folder, check=True)
     return next((folder / "results/small/batches").glob("*-0001"))
@@ -93,7 +82,6 @@ def spent(arguments: list[str]) -> tuple[float, float]:
 
 
 def main() -> int:
-    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, nargs="+", default=[10_000])
     parser.add_argument("--folder", type=Path)

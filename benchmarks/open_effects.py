@@ -110,7 +110,6 @@ def at_limits() -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, default=1, help="of each effect")
     parser.add_argument("--procedure", nargs="+", default=list(PROCEDURES), choices=list(PROCEDURES))

@@ -104,7 +104,6 @@ def diagnosed(sizes: str, seed: int, number: int) -> ScoredCase | None:
 
 
 def main() -> None:
-    """Run it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sizes", choices=DRAWN)
     parser.add_argument("--n", type=int, default=700)

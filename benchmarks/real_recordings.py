@@ -167,7 +167,6 @@ def figures_of(result: UnitResult, unit: str) -> list[MeasuredFigure]:
 
 
 def main() -> None:
-    """Calibrate and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--xsens", type=Path, help="folder of the recording")
     parser.add_argument("--sets", type=Path, help="folder of clones, see benchmarks/sets/sources.yaml")

@@ -111,7 +111,6 @@ def may_be_left_out(name: str) -> bool:
 
 
 def main() -> None:
-    """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, default=2, help="of each effect")
     parser.add_argument("--seed", type=int, default=7)
