@@ -24,9 +24,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import pandas as pd
 from scipy.signal import fftconvolve, lfilter
-from scipy.stats import beta
 
-from imu_research.figures import share, write_figures
+from imu_research.figures import clopper_pearson, share, write_figures
 from pipeline.core.records import Recording
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_search import CompositionSearch, best_of, count_of
@@ -172,8 +171,7 @@ SECOND = {"gauss_markov": "correlation_time_s", "sinusoid": "frequency_hz"}
 
 def interval(k: int, n: int) -> str:
     """Return the 95 % interval of a share by Clopper and Pearson."""
-    low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
-    high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
+    low, high = clopper_pearson(k, n) if n else (0.0, 1.0)
     return f"{k} of {n}: {100 * k / max(n, 1):.1f} % ({100 * low:.1f} to {100 * high:.1f} %)"
 
 

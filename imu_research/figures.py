@@ -80,6 +80,12 @@ def wilson(hits: int, total: int, level: float = 0.95) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
+def clopper_pearson(hits: int, total: int) -> tuple[float, float]:
+    """Return the exact 95 % interval of a share (Clopper and Pearson, Biometrika 26, 1934)."""
+    found = scipy.stats.binomtest(hits, total).proportion_ci(0.95, method="exact")
+    return float(found.low), float(found.high)
+
+
 def share(name: str, right: pd.Series[bool], goal: str = "") -> list[MeasuredFigure]:
     """Return the share of the true values, with the labels of the others as misses; an empty list for no values."""
     hits, total = int(right.sum()), len(right)
