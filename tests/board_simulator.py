@@ -10,15 +10,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.signal import lfilter
+from bench_session import gauss_markov
+from hand_session import fitted
 from scipy.spatial.transform import Rotation
 from unit_settings import settings_of, with_noise
 
 from pipeline.core.records import Recording
-from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.chips import Chip
-from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.estimation.stages import StageInput, fit_stage
+from pipeline.estimation.stages import fit_stage
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
@@ -30,7 +29,6 @@ H = 2e-4  # s, of the differences
 SLOW = 8.0  # deg/s: at a place 5 cm off the axis that adds 0.1 mg
 WHITE = {"accelerometer": 2.8e-3, "gyroscope": 0.035}
 WANDER = {"accelerometer": 1e-4, "gyroscope": 3e-3}
-HAND = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
 
 
 @dataclass(frozen=True)
@@ -109,10 +107,7 @@ def read(
 ) -> dict[str, Array]:
     found = {}
     for sensor, values in truth.items():
-        keep = np.exp(-interval / 100.0)
-        drive = WANDER[sensor] * rng.standard_normal(values.shape)
-        drive[1:] *= np.sqrt(1 - keep**2)
-        slow = lfilter([1.0], [1.0, -keep], drive, axis=0)
+        slow = WANDER[sensor] * gauss_markov(rng, len(values), interval / 100.0)
         clean = chip.bias[sensor] + values @ (chip.K[sensor] @ chip.axes).T
         found[sensor] = clean + noise * (slow + WHITE[sensor] * rng.standard_normal(values.shape))
     return found
@@ -124,7 +119,7 @@ def hand_board(rng: np.random.Generator, chips: Sequence[TrueChip], path: Path, 
     for number, chip in enumerate(chips):
         readings = read(chip, felt(path, chip.place, shift=chip.delay), rng, float(np.diff(path.time).mean()), noise)
         recordings = [Recording("recording", "rests", None, np.round(path.time * 1e9).astype(np.int64), **readings)]
-        fits = {s: fit.fit(StageInput(s, with_noise(recordings, settings), None, settings)) for s, fit in HAND.items()}
+        fits = {s: fitted(s, recordings, settings) for s in WHITE}
         found.append(Chip(f"chip{number}", recordings, fits, settings.sensor))
     return found
 

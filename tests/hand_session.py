@@ -19,6 +19,8 @@ from pipeline.simulation.description import UnitDescription
 from tests.published import diagnose
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pipeline.core.records import Recording, SensorCalibration
     from pipeline.core.settings import Settings
 
@@ -26,24 +28,21 @@ METHODS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_move
 WARM = {"warm_up": 25.0}  # degC in a session of some minutes: a unit that is heated
 
 
+def fitted(sensor: str, recordings: Sequence[Recording], settings: Settings) -> SensorCalibration:
+    """Return the fit of a sensor to recordings by hand."""
+    return METHODS[sensor].fit(StageInput(sensor, with_noise(recordings, settings), None, settings))
+
+
 @dataclass(frozen=True)
 class Unit:
-    """A simulated unit.
-
-    Attributes
-    ----------
-    recordings : list of Recording
-    truth : dict
-    settings : Settings
-        As a stage reads them.
-    """
+    """A simulated unit: its recordings, its truth, and the settings of a run."""
 
     recordings: list[Recording]
     truth: dict[str, Any]
     settings: Settings
 
     def calibrated(self, sensor: str) -> SensorCalibration:
-        return METHODS[sensor].fit(StageInput(sensor, with_noise(self.recordings, self.settings), None, self.settings))
+        return fitted(sensor, self.recordings, self.settings)
 
     def diagnosed(self, sensor: str, configured: Any = (), calibration: SensorCalibration | None = None) -> Any:
         names = configured if isinstance(configured, str) else list(configured)
