@@ -41,9 +41,10 @@ class Path:
     info: dict[str, Any] = field(default_factory=dict)
 
 
-def by_hand(rng: np.random.Generator, rests: int = 24, rate: float = 100.0, *, turn: tuple[float, float] = (50, 140),
-            axis: Array | None = None) -> Path:  # fmt: skip
-    """Rests of 3 s and moves of 1 s, each about an axis at random (or one axis) while the hand shakes."""
+def by_hand(
+    rng: np.random.Generator, rests: int = 24, *, turn: tuple[float, float] = (50, 140), axis: Array | None = None
+) -> Path:
+    """Rests of 3 s and moves of 1 s, each about an axis at random (or one axis) while the hand shakes; 100 Hz."""
     starts, base, turns = [], [Rotation.from_rotvec(rng.uniform(-1, 1, 3))], []
     t = 3.0
     for _ in range(rests - 1):
@@ -53,7 +54,7 @@ def by_hand(rng: np.random.Generator, rests: int = 24, rate: float = 100.0, *, t
         turns.append(vector)
         base.append(base[-1] * Rotation.from_rotvec(vector))
         t += 1.0 + rng.uniform(2.5, 3.5)
-    time = np.arange(0.01, t, 1.0 / rate)
+    time = np.arange(0.01, t, 0.01)
     begin, moves, shake = np.array(starts), np.array(turns), rng.uniform(1, 3, (rests, 3))
     quats = np.array([b.as_quat() for b in base])
 
@@ -102,22 +103,20 @@ def draw_chip(rng: np.random.Generator, axes: Array, place: Array, delay: float 
     return TrueChip(axes, place, bias, K, delay)
 
 
-def read(
-    chip: TrueChip, truth: dict[str, Array], rng: np.random.Generator, interval: float, noise: float = 1.0
-) -> dict[str, Array]:
+def read(chip: TrueChip, truth: dict[str, Array], rng: np.random.Generator, interval: float) -> dict[str, Array]:
     found = {}
     for sensor, values in truth.items():
         slow = WANDER[sensor] * gauss_markov(rng, len(values), interval / 100.0)
         clean = chip.bias[sensor] + values @ (chip.K[sensor] @ chip.axes).T
-        found[sensor] = clean + noise * (slow + WHITE[sensor] * rng.standard_normal(values.shape))
+        found[sensor] = clean + slow + WHITE[sensor] * rng.standard_normal(values.shape)
     return found
 
 
-def hand_board(rng: np.random.Generator, chips: Sequence[TrueChip], path: Path, noise: float = 1.0) -> list[Chip]:
+def hand_board(rng: np.random.Generator, chips: Sequence[TrueChip], path: Path) -> list[Chip]:
     """Return the chips of a board that was moved by hand, calibrated each by itself."""
     settings, found = settings_of(sensor="mpu6050", table="hand", procedure={"holdout_every": 3}), []
     for number, chip in enumerate(chips):
-        readings = read(chip, felt(path, chip.place, shift=chip.delay), rng, float(np.diff(path.time).mean()), noise)
+        readings = read(chip, felt(path, chip.place, shift=chip.delay), rng, float(np.diff(path.time).mean()))
         recordings = [Recording("recording", "rests", None, np.round(path.time * 1e9).astype(np.int64), **readings)]
         fits = {s: fitted(s, recordings, settings) for s in WHITE}
         found.append(Chip(f"chip{number}", recordings, fits, settings.sensor))
@@ -127,7 +126,7 @@ def hand_board(rng: np.random.Generator, chips: Sequence[TrueChip], path: Path, 
 UP = {"x": [0, 0, 1], "y": [0, 0, 1], "z": [1, 0, 0]}
 
 
-def table_path(axis: str, rates: Sequence[float], rate: float = 50.0, turn_s: float = 4.0) -> Path:
+def table_path(axis: str, rates: Sequence[float], rate: float, turn_s: float = 4.0) -> Path:
     """Return a turn about one axis: rest, ramp, turn, ramp, rest for each rate."""
     knots = [(0.0, 0.0)]
     for w in rates:
@@ -162,8 +161,10 @@ def table_path(axis: str, rates: Sequence[float], rate: float = 50.0, turn_s: fl
     return Path(time, attitude, lambda x: np.zeros((len(x), 3)), {"angle": angle_at(time), "rate": smooth_rate(time)})
 
 
-def table_board(rng: np.random.Generator, chips: Sequence[TrueChip], plans: dict[str, Sequence[float]],
-                noise: float = 1.0, rate: float = 50.0, **table: float) -> list[Chip]:  # fmt: skip
+def table_board(
+    rng: np.random.Generator, chips: Sequence[TrueChip], plans: dict[str, Sequence[float]], rate: float = 50.0,
+    **table: float,
+) -> list[Chip]:  # fmt: skip
     """Return the chips of a board that was turned on a table, calibrated each by itself against the table's log.
 
     ``plans``: turn axis to the rates of the gyroscope's recordings; the accelerometer's turn slowly.
@@ -175,7 +176,7 @@ def table_board(rng: np.random.Generator, chips: Sequence[TrueChip], plans: dict
     for number, chip in enumerate(chips):
         recordings, start = [], 1.0
         for role, axis, path in paths:
-            readings = read(chip, felt(path, chip.place), rng, 1.0 / rate, noise)
+            readings = read(chip, felt(path, chip.place), rng, 1.0 / rate)
             stamps = np.round((path.time + start) * 1e9).astype(np.int64)
             start += float(path.time[-1]) + 10.0
             name = ("accel_" if role == "accelerometer" else "gyro_") + axis

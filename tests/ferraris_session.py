@@ -31,12 +31,11 @@ class Session(Unit):
         return error, np.sqrt(np.diag(found.covariance))[:12], found.freedom[:12]
 
 
-def simulated(seed: int, *, model: str = "mpu6050", procedure: Any = None, **unit: Any) -> Session:
+def simulated(seed: int, *, procedure: Any = None, **unit: Any) -> Session:
     """Return a simulated unit; ``procedure`` replaces settings of the procedure, ``unit`` those of its description."""
-    described = UnitDescription("U", sensor=model, table="hand", procedure="ferraris", **{"interval_s": 0.02, **unit})
-    recordings, truth = simulate_unit(described, seed, 0)
-    settings = settings_of(settings_of(sensor=model, table="hand", procedure="ferraris"), procedure=procedure or {})
-    return Session(recordings, truth, settings)
+    groups = {"sensor": "mpu6050", "table": "hand", "procedure": "ferraris"}
+    recordings, truth = simulate_unit(UnitDescription("U", **groups, **{"interval_s": 0.02, **unit}), seed, 0)
+    return Session(recordings, truth, settings_of(settings_of(**groups), procedure=procedure or {}))
 
 
 def held_out(session: Session) -> Session:

@@ -91,8 +91,7 @@ class Unit:
         between: float = BETWEEN,
     ) -> None:
         """Record a file; ``warmth``: (n,), degC, a further column."""
-        start = 0.0
-        time = start + np.arange(len(rate)) / hz
+        time = np.arange(len(rate)) / hz
         readings = []
         if "a" in sensors:
             readings.append(self.read("accelerometer", force, np.zeros(3), hz))
@@ -169,10 +168,10 @@ def turns(unit: Unit, sensors: str) -> None:
             unit.write(f"turn_{axis}_{k}", f"turn,{axis},{shown},{accuracy:.3g},", *joined(*parts), sensors)
 
 
-def on_table(unit: Unit, sensors: str, axis: int, logged: str, off_deg: float = 0.1) -> None:
+def on_table(unit: Unit, sensors: str, axis: int, logged: str) -> None:
     """Steps by 45 deg about a body axis, with rests, and back at once, on a table that logs ``angle`` or ``rate``."""
     e, up = np.eye(3)[axis], np.eye(3)[0 if axis == 2 else 2]
-    e = e + np.radians(off_deg) * unit.rng.normal(size=3) * (np.arange(3) != axis)
+    e = e + np.radians(0.1) * unit.rng.normal(size=3) * (np.arange(3) != axis)
     e /= np.linalg.norm(e)
     parts, angles, reached = [at_rest(4.0, up)], [np.zeros(round(4.0 * RATE_HZ))], 0.0
     for step in (*[45.0] * 7, -315.0):
@@ -221,7 +220,7 @@ def attitudes(unit: Unit) -> None:
 def slow(unit: Unit) -> None:
     """Slow movement through all attitudes for one to four minutes, with accelerations of 2 to 20 mg."""
     rng, n = unit.rng, round(unit.rng.uniform(60.0, 240.0) * RATE_HZ)
-    time, force = np.arange(n) / RATE_HZ, np.empty((n, 3))
+    time = np.arange(n) / RATE_HZ
     swings = [sum(rng.uniform(0.5, 1.0) * np.sin(2.0 * np.pi * rng.uniform(0.02, 0.06) * time + p) for p in phase)
               for phase in rng.uniform(0.0, 2.0 * np.pi, (2, 3))]  # fmt: skip
     around, above = np.pi * swings[0], 1.2 * swings[1]
