@@ -100,6 +100,10 @@ class Copy:
             raise NotApplicableError(f"{self.base} has no {found}")
         return [found]
 
+    def chosen(self, scope: str) -> list[Table]:
+        """Return the tables of the recordings that a scope means."""
+        return [self.tables[name] for name in self.recordings(scope)]
+
     def map_readings(self, scope: str, sensor: str, A: np.ndarray) -> None:
         """Replace readings by A @ reading; in all files the truth is that of the new readings."""
         for name in self.recordings(scope):
@@ -130,6 +134,11 @@ def put(table: Table, columns: Iterable[str], new: np.ndarray) -> None:
     """Set columns."""
     for column, each in zip(columns, np.asarray(new, float).T, strict=True):
         table[column] = each
+
+
+def add(table: Table, sensor: str, change: np.ndarray) -> None:
+    """Add to the readings of a sensor."""
+    put(table, COLUMNS[sensor], values(table, COLUMNS[sensor]) + change)
 
 
 def rows_of(table: Table, chosen: np.ndarray) -> Table:
