@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import unit_settings
+from bench_session import BIAS, K
 from scipy.spatial.transform import Rotation
 
 from pipeline.checks.bench import signed_axis
@@ -14,11 +15,6 @@ from pipeline.core.records import Recording
 from pipeline.core.settings import RecordingFile, Settings
 
 INTERVAL_S = 0.12
-BIAS = {"accelerometer": np.array([0.03, -0.02, 0.05]), "gyroscope": np.array([1.2, -0.8, 0.5])}
-K = {
-    "accelerometer": np.array([[1.01, 0.004, -0.006], [0.002, 0.99, 0.005], [-0.003, 0.007, 1.02]]),
-    "gyroscope": np.array([[0.99, 0.006, -0.002], [-0.004, 1.015, 0.003], [0.005, -0.001, 1.004]]),
-}
 USUAL_UP = {"x": "+z", "y": "+z", "z": "+x"}
 # Rests at 24 angles for the accelerometer, turns both ways between rests for the gyroscope.
 STEPS = np.repeat(np.arange(0.0, 361.0, 15.0), 12)
