@@ -40,8 +40,6 @@ from pipeline.simulation.description import UnitDescription, shipped_settings
 from pipeline.unit import run_checked
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from pipeline.core.records import Recording, SensorCalibration
     from pipeline.core.settings import Settings
 
@@ -164,12 +162,6 @@ def study(methods: list[str], condition: str, number: int, seed: int, table: str
     return found
 
 
-def joined(units: Iterable[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return the rows of all units, by method."""
-    found = list(units)
-    return {name: np.array([each[name] for each in found]) for name in found[0]}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, default=1000)
@@ -189,9 +181,10 @@ def main() -> None:
         units = range(arguments.first, arguments.first + arguments.n)
         of_unit = partial(study, methods, condition, seed=arguments.seed, table=arguments.table)
         with ProcessPoolExecutor(arguments.processes, get_context("spawn")) as pool:
-            found = joined(pool.map(of_unit, units, chunksize=4))
+            found = list(pool.map(of_unit, units, chunksize=4))
         print(f"{condition}, n = {arguments.n}, seed {arguments.seed}, {time.monotonic() - start:.0f} s")
-        for name, ratios in found.items():
+        for name in found[0]:
+            ratios = np.array([unit[name] for unit in found])
             known = ~np.all(np.isnan(ratios), axis=0)
             inside = np.abs(ratios[:, known]) <= 1.0
             figures += clustered_share(f"{name}, {condition}", list(inside), "contains 95 %")

@@ -80,7 +80,6 @@ def drawn(rng: np.random.Generator) -> tuple[int, float, list[Term]]:
 
 
 def simulated(rng: np.random.Generator, n: int, dt: float, terms: list[Term]) -> Values:
-    """Return n samples of a mixture."""
     out, t = np.zeros(n), np.arange(n) * dt
     for letter, size, *more in terms:
         white = rng.standard_normal(n)
@@ -206,14 +205,8 @@ def main() -> None:
         elif enough:
             wrong[" ".join(truth), " ".join(got)] += 1
             if options.verbose:
-                print(
-                    n,
-                    dt,
-                    terms,
-                    got,
-                    [(r["terms"], round(r["delta_bic"], 1)) for r in found["ranking"][:4]],
-                    flush=True,
-                )
+                best = [(r["terms"], round(r["delta_bic"], 1)) for r in found["ranking"][:4]]
+                print(n, dt, terms, got, best, flush=True)
     print(f"mixtures drawn: {drawn_total}; CPU of the identification, s an axis: {spent / drawn_total:.3f}")
     print("right composition, long enough:", interval(sum(right), len(right)))
     print("right composition, the others:", interval(sum(short_right), len(short_right)))

@@ -65,7 +65,6 @@ def _best(
 
 
 def _rms(M: np.ndarray, b: np.ndarray, readings: np.ndarray, truth: np.ndarray) -> float:
-    """Return the rms of the calibrated reading's error."""
     return float(np.sqrt(np.mean(np.sum(((readings - b) @ M.T - truth) ** 2, axis=1))))
 
 
