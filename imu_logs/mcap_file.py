@@ -68,7 +68,6 @@ ONLY_IN_SUMMARY = frozenset(Opcode) - ONLY_IN_DATA - frozenset(DEFINITIONS)
 _KINDS = frozenset(Opcode)
 COPY_AGAIN = "copy the file again from its source"
 RUN_SIZE = 1 << 20  # bytes of messages outside chunks that are returned together, as the recorders' usual chunk
-_RECORD = struct.Struct("<BQ")
 
 
 @dataclass
