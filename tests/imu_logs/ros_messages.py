@@ -14,18 +14,7 @@ if TYPE_CHECKING:
 
     from rosbags.typesys.store import Typestore
 
-NUMPY = {
-    "int8": np.int8,
-    "uint8": np.uint8,
-    "int16": np.int16,
-    "uint16": np.uint16,
-    "int32": np.int32,
-    "uint32": np.uint32,
-    "int64": np.int64,
-    "uint64": np.uint64,
-    "float32": np.float32,
-    "float64": np.float64,
-}
+NUMBERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
 NAME = "lab_msgs/msg/Sample"
 INNER = "lab_msgs/msg/Inner"
 FIRST_NS = 1_700_000_000_123_456_789
@@ -140,8 +129,8 @@ def value_of(
     values: np.random.Generator,
 ) -> Any:
     count = int(lengths.integers(0, 4)) if item.count == -1 else item.count
-    if item.kind in NUMPY:
-        code = np.dtype(NUMPY[item.kind])
+    if item.kind in NUMBERS:
+        code = np.dtype(item.kind)
         if code.kind == "f":
             numbers = values.normal(size=max(1, count)).astype(code)
         else:
