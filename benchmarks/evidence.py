@@ -74,12 +74,10 @@ class Stored:
 
     @classmethod
     def of(cls, name: str) -> Self:
-        """Read a stored measure."""
         document = json.loads((FOLDER / "stored" / f"{name}.json").read_text(encoding="utf-8"))
         return cls(**{**document, "figures": [MeasuredFigure.from_json(f) for f in document["figures"]]})
 
     def write(self, name: str) -> None:
-        """Store it."""
         document = {**asdict(self), "figures": [figure.to_json() for figure in self.figures]}
         text = json.dumps(document, indent=1) + "\n"
         (FOLDER / "stored" / f"{name}.json").write_text(text, encoding="utf-8")
@@ -101,7 +99,6 @@ class Stored:
 
 
 def measures() -> dict[str, Measure]:
-    """Return the measures by name."""
     listed: Mapping[str, Mapping[str, object]] = yaml.safe_load((FOLDER / "measures.yaml").read_text(encoding="utf-8"))
     return {name: Measure(**values) for name, values in listed.items()}
 
@@ -191,7 +188,6 @@ def stated(figure: MeasuredFigure) -> str:
 
 
 def ratio(figure: MeasuredFigure) -> str:
-    """Return a ratio with its interval."""
     return f"{figure.value:.3g} ({ends(figure)})"
 
 

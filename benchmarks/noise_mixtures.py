@@ -220,7 +220,6 @@ def main() -> None:
 
 
 def told(covered: dict[tuple[str, bool], list[bool]]) -> None:
-    """Print the shares of intervals that cover."""
     for enough in (True, False):
         every = [v for (_, e), values in covered.items() if e == enough for v in values]
         print(f"intervals that cover, {'long enough' if enough else 'the others'}:", interval(sum(every), len(every)))
@@ -229,7 +228,6 @@ def told(covered: dict[tuple[str, bool], list[bool]]) -> None:
 
 
 def axis_of(values: Values, dt: float) -> dict[str, Any]:
-    """Return the noise that is identified in one axis."""
     zero = np.zeros_like(values)
     time_ns = np.rint(np.arange(len(values)) * dt * 1e9).astype(np.int64)
     recording = Recording("static", "static", None, time_ns, gyroscope=np.stack([values, zero, zero], axis=1))

@@ -143,7 +143,6 @@ def figures_of_set(campaign: Path, unit: str, authors: dict[str, Entry] | None) 
 
 
 def figures_of(result: UnitResult, unit: str) -> list[MeasuredFigure]:
-    """Return the figures of a calibrated unit."""
     validation: dict[str, Any] = result.validation
     found = []
     for sensor, (scale, measured_in) in SENSORS.items():

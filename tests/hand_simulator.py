@@ -106,7 +106,6 @@ def level_up(q: Array) -> Array:
 
 
 def draw(hand: Hand, seed: int) -> Drawn:
-    """Draw a unit and its recording."""
     return draw_together(hand, seed, 1)[0]
 
 

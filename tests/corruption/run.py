@@ -53,7 +53,6 @@ def main() -> int:
 
 
 def parsed() -> argparse.Namespace:
-    """Return the options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--units", type=int, default=170, help="corrupted units; the first go through all ways, class by class")
@@ -74,7 +73,6 @@ def parsed() -> argparse.Namespace:
 
 
 def drawn(options: argparse.Namespace) -> list[Copy]:
-    """Return the units of a draw."""
     ways = single_ways()
     copies = []
     for number in range(options.start, options.start + options.units):
@@ -144,7 +142,6 @@ def run(copies: list[Copy], out: Path, calibrate: Callable[[Path, Path], object]
 
 
 def sheet(campaign: Path, rows: list[dict[str, str]]) -> None:
-    """Write units.csv."""
     campaign.mkdir(parents=True, exist_ok=True)
     with (campaign / "units.csv").open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS, restval="")

@@ -96,7 +96,6 @@ class Recorded:
                 self.unseen = "a unit at rest shows neither scale factor nor sign of its gyroscope"
 
     def write(self) -> None:
-        """Write files and sheet."""
         for name, table in self.files.items():
             table.to_csv(self.unit.folder / f"{name}.csv", index=False, float_format="%.10g")
         (self.unit.folder / "recordings.csv").write_text("\n".join(map(",".join, self.rows)) + "\n")

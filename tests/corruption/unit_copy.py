@@ -131,7 +131,6 @@ def values(table: Table, columns: Iterable[str]) -> np.ndarray:
 
 
 def put(table: Table, columns: Iterable[str], new: np.ndarray) -> None:
-    """Set columns."""
     for column, each in zip(columns, np.asarray(new, float).T, strict=True):
         table[column] = each
 
@@ -165,7 +164,6 @@ def table_of(recording: Any) -> Table:
 
 
 def write(copy: Copy, folder: Path) -> None:
-    """Write the recordings of a unit."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, table in copy.tables.items():
         if copy.format == "mcap":

@@ -201,7 +201,6 @@ NEVER_DIES = 8
 
 
 def cases() -> dict[str, Case]:
-    """Return all cases, named by their number."""
     whole = text()
     micro = 2**32 - 12_345_678
     wrapping = [str((micro + 10_000 * i) % 2**32) for i in range(SAMPLES)]

@@ -38,7 +38,6 @@ class Setup:
     seat: Any = (0.0, 0.0, 0.0)
 
     def recording(self, role: str, seed: int = 0, noise: float = 1.0) -> Recording:
-        """Return the turn as it is logged."""
         turned = STEPS if role == "accelerometer" else np.cumsum(RATE) * INTERVAL_S
         rate = np.zeros_like(STEPS) if role == "accelerometer" else RATE
         axis, up = signed_axis(f"+{self.axis}"), signed_axis(self.up or USUAL_UP[self.axis])

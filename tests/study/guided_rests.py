@@ -82,7 +82,6 @@ class Unit:
         return float(np.count_nonzero(np.abs(error) <= coverage_factor(progress.freedom) * u))
 
     def recording(self) -> Recording:
-        """Return the log so far."""
         force = np.concatenate(self.log)
         time = np.round(np.arange(len(force)) / RATE_HZ * 1e9).astype(np.int64)
         return Recording("recording", "rests", None, time, accelerometer=force)

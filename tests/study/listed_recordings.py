@@ -108,7 +108,6 @@ class Unit:
         self.rows.append(f"{name}.csv,{row}")
 
     def sheet(self) -> None:
-        """Write the sheet."""
         (self.folder / "recordings.csv").write_text("\n".join(self.rows) + "\n")
 
 
