@@ -51,7 +51,7 @@ METRICS = {
 }
 APPLIED = "by the printed parameters, applied to our held-out motion"
 STAGE_OF_LETTER = {"O": "orthogonality", "M": "misalignment", "b": "bias", "S": "scale_factor"}
-AS_PRINTED = "as printed: Cholesky and LU's forward matrix applied as if it were the correction"
+CHOLESKY_AS_PRINTED = "as printed: Cholesky and LU's forward matrix applied as if it were the correction"
 # The comparison of methods: its two methods, for the thesis as printed and with errata corrected.
 COMPARED_FIGURES = {
     "accelerometer": {
@@ -59,7 +59,7 @@ COMPARED_FIGURES = {
         "by the staged method with its errata corrected": ("staged", "least-squares"),
     },
     "gyroscope": {
-        AS_PRINTED: ("staged", "cholesky-printed"),
+        CHOLESKY_AS_PRINTED: ("staged", "cholesky-printed"),
         "inverted: Cholesky and LU's matrix as it is meant": ("staged", "cholesky"),
     },
 }
