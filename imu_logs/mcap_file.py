@@ -1,4 +1,13 @@
-"""Parse records of an MCAP file with the official library; unpack chunks and split them into messages.
+"""Read MCAP files in one pass from the first byte to the last, and check that they are complete.
+
+    file   = magic | data section | summary | magic
+    record = opcode (1 byte) | length (8 bytes) | content (length bytes)
+
+The official library parses a record. It returns short data if a length is too large, ignores contradicting lengths,
+does not check the checksum of attachments, and reads an index entry by entry; here such records are refused, and an
+index is read as an array. Also checked are the checksums of each chunk, the data section and the summary (0: the
+recorder computed none), and the counts in the summary. Every length is first compared with the number of remaining
+bytes.
 
 A run of records (a chunk, or the messages between chunks) is split by following the lengths from record to record:
 
@@ -6,20 +15,8 @@ A run of records (a chunk, or the messages between chunks) is split by following
 
 If all records have one length, the starts are an arithmetic series. If the file has an index, they are its offsets.
 Else the lengths are followed one by one. numpy checks the first two with the rule above, so that a wrong index has no
-effect.
-
-The library returns short data if a length is too large, ignores contradicting lengths, does not check the checksum of
-attachments, and reads an index entry by entry. Here such records are refused, and an index is read as an array.
-
-Read MCAP files in one pass from the first byte to the last, and check that they are complete.
-
-    file   = magic | data section | summary | magic
-    record = opcode (1 byte) | length (8 bytes) | content (length bytes)
-
-Checked are the checksums of each chunk, each attachment, the data section and the summary (0: the recorder computed
-none); that records fill their chunks; and that the counts in the summary are right. Every length is first compared with
-the number of remaining bytes. Messages are returned chunk by chunk, so that the largest chunk determines the memory. A
-file is known to be complete only after the iteration has ended without an error.
+effect. Messages are returned run by run, so that the largest chunk determines the memory. A file is known to be
+complete only after the iteration has ended without an error.
 """
 
 from __future__ import annotations
