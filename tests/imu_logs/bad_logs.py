@@ -147,22 +147,18 @@ def indexed() -> dict[str, Any]:
     return {n: {"column": i, "unit": u} for i, (n, u) in enumerate(zip(names, units, strict=True))}
 
 
-def stuck(last: int = 1100) -> bytes:
+def edited(rows: slice, columns: int | slice, value: float | np.ndarray) -> bytes:
     values = VALUES.copy()
-    values[1000:last, 5] = values[1000, 5]
+    values[rows, columns] = value
     return text(rows_of(values))
 
 
-def clipped() -> bytes:
-    values = VALUES.copy()
-    values[420:424, 4] = 250.0
-    return text(rows_of(values))
+def stuck(last: int) -> bytes:
+    return edited(slice(1000, last), 5, VALUES[1000, 5])
 
 
 def scaled(columns: slice, factor: float) -> bytes:
-    values = VALUES.copy()
-    values[:, columns] *= factor
-    return text(rows_of(values))
+    return edited(slice(None), columns, factor * VALUES[:, columns])
 
 
 def reordered() -> list[str]:
@@ -416,10 +412,10 @@ def cases() -> dict[str, Case]:
         ),
         "37": read(times([f"{0.01 * i + 0.004 * ((i * 7) % 3 == 0):.3f}" for i in range(SAMPLES)]), "N-JITTER"),
         "37 too much": read(times([f"{0.01 * i + 0.008 * (i % 2):.3f}" for i in range(SAMPLES)]), "N-JITTER"),
-        "38": read(stuck(), "N-STUCK", kept=None, flags={1000: 4, 1099: 4}),
+        "38": read(stuck(1100), "N-STUCK", kept=None, flags={1000: 4, 1099: 4}),
         "38 half": refused(stuck(2900), "stuck", "gyro_y stays at one value .* in 1900 of 3000 rows"),
         "38 dead": refused(scaled(slice(6, 7), 0.0), "stuck", "gyro_z is 0 deg/s in all 3000 rows"),
-        "39": read(clipped(), "N-CLIP", kept=None, flags={420: 2, 423: 2}),
+        "39": read(edited(slice(420, 424), 4, 250.0), "N-CLIP", kept=None, flags={420: 2, 423: 2}),
         "40 axis": refused(
             with_table_axis((2, 0, 1)), "wrong_axis", "said to turn about x, and the gyroscope turns about y"
         ),
