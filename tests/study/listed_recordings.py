@@ -37,7 +37,6 @@ TAU_S = 100.0
 LIMITS = {"accelerometer": (0.08, 0.03, 0.02), "gyroscope": (20.0, 0.03, 0.02)}
 BETWEEN = 0.01  # deg/s, of the gyroscope's bias between files
 CONTAINED = {"bias_temperature", "bias_temperature_quadratic"}  # in bias_temperature_cubic, whose third power may hide
-COLUMNS = "time_s,accel_x_g,accel_y_g,accel_z_g,gyro_x_dps,gyro_y_dps,gyro_z_dps"
 
 
 if TYPE_CHECKING:
@@ -91,19 +90,17 @@ class Unit:
         between: float = BETWEEN,
     ) -> None:
         """Record a file; ``warmth``: (n,), degC, a further column."""
-        time = np.arange(len(rate)) / hz
-        readings = []
+        header, columns = "time_s", [np.arange(len(rate)) / hz]
         if "a" in sensors:
-            readings.append(self.read("accelerometer", force, np.zeros(3), hz))
+            header += ",accel_x_g,accel_y_g,accel_z_g"
+            columns.append(self.read("accelerometer", force, np.zeros(3), hz))
         if "g" in sensors:
-            readings.append(self.read("gyroscope", rate, between * self.rng.normal(size=3), hz))
-        names = COLUMNS.split(",")
-        used = [0, *([1, 2, 3] if "a" in sensors else []), *([4, 5, 6] if "g" in sensors else [])]
-        header = ",".join(names[i] for i in used)
+            header += ",gyro_x_dps,gyro_y_dps,gyro_z_dps"
+            columns.append(self.read("gyroscope", rate, between * self.rng.normal(size=3), hz))
         if warmth is not None:
             header += ",temperature_degc"
-            readings.append(warmth[:, None] + 0.02 * self.rng.normal(size=(len(warmth), 1)))
-        table = np.column_stack([time, *readings])
+            columns.append(warmth[:, None] + 0.02 * self.rng.normal(size=(len(warmth), 1)))
+        table = np.column_stack(columns)
         np.savetxt(self.folder / f"{name}.csv", table, fmt="%.9g", delimiter=",", header=header, comments="")
         self.rows.append(f"{name}.csv,{row}")
 
