@@ -119,10 +119,7 @@ def _wrong_parameters(found: Any, truth: Truth, turn: np.ndarray) -> str:
     worst, where = 0.0, ""
     for name, true in (("bias", truth.bias), ("matrix", turn @ truth.matrix)):
         off = np.abs(np.array(found[name]) - true)
-        stated = np.array(
-            [[np.nan if u is None else u for u in np.atleast_1d(row)] for row in found["expanded_uncertainty"][name]],
-            float,
-        ).reshape(off.shape)
+        stated = np.array(found["expanded_uncertainty"][name], float)  # None: nan
         ratio = off / np.maximum(np.nan_to_num(stated), LEAST_U)
         at = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
         if ratio[at] > worst:

@@ -174,11 +174,8 @@ def write(copy: Copy, folder: Path) -> None:
 
 def _write_csv(path: Path, table: Table) -> None:
     formats = ["%.15g" if column == TIME else "%.10g" for column in table]
-    matrix = np.stack(list(table.values()), axis=1)
-    with path.open("w", encoding="utf-8") as stream:
-        stream.write(",".join(table) + "\n")
-        row = ",".join(formats) + "\n"
-        stream.writelines(row % tuple(line) for line in matrix.tolist())
+    rows = np.stack(list(table.values()), axis=1)
+    np.savetxt(path, rows, formats, delimiter=",", header=",".join(table), comments="")
 
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
