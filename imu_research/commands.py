@@ -84,13 +84,8 @@ def thesis(argv: Sequence[str]) -> int:
     """Compare the results with the figures of the thesis, and test its conclusions over many seeds."""
     parser = parser_of("thesis", thesis.__doc__, THESIS)
     parser.add_argument("what", choices=("page", "seeds"))
-    parser.add_argument(
-        "--campaign",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="campaign with simulation.yaml and the folder printed/",
-    )
+    words = "campaign with simulation.yaml and the folder printed/"
+    parser.add_argument("--campaign", type=Path, required=True, metavar="DIR", help=words)
     parser.add_argument("--results", type=Path, metavar="DIR", help="page: results of the campaign")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="file to write")
     parser.add_argument("--seeds", type=int, default=50, help="seeds: how many (default: 50)")

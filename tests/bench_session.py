@@ -112,16 +112,8 @@ class Session:
 def record(session: Session) -> list[Recording]:
     """Return the recordings of both sensors."""
     rng = np.random.default_rng(session.seed)
-    air = Environment(
-        25.0 + rng.uniform(-1, 1),
-        4.5,
-        300.0,
-        0.3,
-        np.array([2100.0, 4700.0]),
-        rng.uniform(0, 6, 2),
-        session.ramp,
-        2000.0,
-    )
+    mean, phase = 25.0 + rng.uniform(-1, 1), rng.uniform(0, 6, 2)
+    air = Environment(mean, 4.5, 300.0, 0.3, np.array([2100.0, 4700.0]), phase, session.ramp, 2000.0)
     course = replace(session.course, static_s=session.course.static_s if session.static else 0.0)
     planned, start, plans = plan("three_axis_turns", course, rng), 30.0, []
     for item in planned:

@@ -60,16 +60,8 @@ class Unit:
 def _simulated(  # noqa: PLR0917  (its arguments are the key)
     model: str, seed: int, procedure: str, effects: tuple, temperature: tuple, other: tuple
 ) -> Any:
-    unit = UnitDescription(
-        "U",
-        sensor=model,
-        table="hand",
-        procedure=procedure,
-        effects=dict(effects),
-        temperature=dict(temperature),
-        **dict(other),
-    )
-    return simulate_unit(unit, seed, 0)
+    more = {"effects": dict(effects), "temperature": dict(temperature), **dict(other)}
+    return simulate_unit(UnitDescription("U", sensor=model, table="hand", procedure=procedure, **more), seed, 0)
 
 
 def hand_held(

@@ -56,12 +56,8 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--units", type=int, default=170, help="corrupted units; the first go through all ways, class by class")
-    add(
-        "--start",
-        type=int,
-        default=0,
-        help="number of the first; beyond the ways, units are random, some changed twice",
-    )
+    words = "number of the first; beyond the ways, units are random, some changed twice"
+    add("--start", type=int, default=0, help=words)
     add("--seed", type=int, default=1)
     add("--good", type=int, default=0, help="units that are not corrupted, beside them")
     add("--only", nargs="+", default=[], metavar="UNIT", help="only these units of the draw")
@@ -88,12 +84,8 @@ def drawn(options: argparse.Namespace) -> list[Copy]:
             copies.append(copy)
     bases = list(BASES)
     for number in range(options.good):
-        copy = good_unit(
-            bases[number % len(bases)],
-            900_000 + 1000 * options.seed + number,
-            f"good{number:03d}",
-            varied=number >= len(bases),
-        )
+        base, seed = bases[number % len(bases)], 900_000 + 1000 * options.seed + number
+        copy = good_unit(base, seed, f"good{number:03d}", varied=number >= len(bases))
         copy.kind, copy.way, copy.harmless = "(not corrupted)", "good", True
         copies.append(copy)
     return copies

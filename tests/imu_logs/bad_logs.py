@@ -200,6 +200,13 @@ def cases() -> dict[str, Case]:
     whole = text()
     micro = 2**32 - 12_345_678
     wrapping = [str((micro + 10_000 * i) % 2**32) for i in range(SAMPLES)]
+    sprinkled = text([r if i % 100 else "x" for i, r in enumerate(ROWS)])
+    nul_row = changed(5, "0.05" + "\0" * 64)
+    with_preamble, with_comment = b"Fs,100\nmode,0\n" + whole, b"# made by hand\n" + whole
+    header_again = text([*ROWS[:1500], HEADER, *ROWS[:1500]])
+    from_earlier = text([*ROWS[:1500], *ROWS[200:1000]])
+    rebooted = text([*ROWS[:1500], "rst cause:2", "boot", *ROWS[200:1000]])
+    decimal_commas = whole.replace(b",", b";").replace(b".", b",")
     unix = [f"{1.7e18 + 5000.0 * i:.17g}" for i in range(SAMPLES)]
     out = {
         "01": Case({}, "unreadable", "is a directory"),
@@ -229,7 +236,7 @@ def cases() -> dict[str, Case]:
         "09": read(changed(SAMPLES - 1, "29.99,0.1"), "N-TAIL", kept=without(SAMPLES - 1)),
         "10 short": refused(changed(5, "0.05,0.1"), "bad_row", "has 2 fields where 7 are expected", line=7),
         "10 many": refused(
-            text([r if i % 100 else "x" for i, r in enumerate(ROWS)]),
+            sprinkled,
             "bad_row",
             r"has 1 fields where 7 are expected: 'x' \(29 more such lines, up to line 2902: 102, 202, 302, 402 ",
             line=2,
@@ -239,7 +246,7 @@ def cases() -> dict[str, Case]:
             changed(5, ROWS[5][:-2] + "\n" + ROWS[5][-2:]), "N-BADROW", "N-GAP", kept=without(5), settings=DROP
         ),
         "10 over budget": refused(
-            text([r if i % 100 else "x" for i, r in enumerate(ROWS)]),
+            sprinkled,
             "bad_row",
             "30 of 3000 rows would have to be repaired, more than the share of 0.001",
             line=2,
@@ -249,23 +256,19 @@ def cases() -> dict[str, Case]:
         "11 drop": read(
             text([*ROWS[:5], ROWS[5] + ROWS[6], *ROWS[7:]]), "N-BADROW", "N-GAP", kept=without(5, 6), settings=DROP
         ),
-        "12": refused(changed(5, "0.05" + "\0" * 64), "nul", "64 NUL bytes, the first at byte", line=7),
-        "12 drop": read(changed(5, "0.05" + "\0" * 64), "N-BADROW", "N-GAP", kept=without(5), settings=DROP),
+        "12": refused(nul_row, "nul", "64 NUL bytes, the first at byte", line=7),
+        "12 drop": read(nul_row, "N-BADROW", "N-GAP", kept=without(5), settings=DROP),
         "13": read(whole + bytes(4096), "N-NULTAIL"),
-        "14": refused(
-            b"Fs,100\nmode,0\n" + whole, "missing_column", "line 3 holds them: set ingest.csv.skip_lines", line=1
-        ),
-        "14 profile": read(b"Fs,100\nmode,0\n" + whole, settings={"csv/skip_lines": 2}),
+        "14": refused(with_preamble, "missing_column", "line 3 holds them: set ingest.csv.skip_lines", line=1),
+        "14 profile": read(with_preamble, settings={"csv/skip_lines": 2}),
         "14 gcsv": Case({"log.gcsv": gcsv()}, kept=ALL),
-        "15": refused(b"# made by hand\n" + whole, "missing_column", "found # made by hand", line=1),
-        "15 profile": read(b"# made by hand\n" + whole, "N-COMMENT", settings={"csv/comment": "#"}),
+        "15": refused(with_comment, "missing_column", "found # made by hand", line=1),
+        "15 profile": read(with_comment, "N-COMMENT", settings={"csv/comment": "#"}),
         "15 header": read(b"# " + whole, "N-COMMENT", settings={"csv/comment": "#", "csv/header": "commented"}),
         "16": refused(text(ROWS[1:], ROWS[0]), "no_header", "set ingest.csv.header=false", line=1),
         "16 indexed": read(whole.partition(b"\n")[2], settings={"csv/header": False, "csv/columns": indexed()}),
-        "17": refused(text([*ROWS[:1500], HEADER, *ROWS[:1500]]), "restarted", "by its key session", line=1502),
-        "17 session": read(
-            text([*ROWS[:1500], HEADER, *ROWS[:1500]]), "N-SESSION", kept=ALL[:1500], settings={"csv/session": 2}
-        ),
+        "17": refused(header_again, "restarted", "by its key session", line=1502),
+        "17 session": read(header_again, "N-SESSION", kept=ALL[:1500], settings={"csv/session": 2}),
         "18": refused(
             whole.replace(b"gyro_y", b"gyro_x"), "duplicate_column", "gyro_x_dps occurs more than once", line=1
         ),
@@ -278,16 +281,8 @@ def cases() -> dict[str, Case]:
             ),
             "N-ORDER",
         ),
-        "21": refused(
-            whole.replace(b",", b";").replace(b".", b","),
-            "decimal_comma",
-            "a decimal comma",
-            line=2,
-            settings={"csv/delimiter": ";"},
-        ),
-        "21 profile": read(
-            whole.replace(b",", b";").replace(b".", b","), settings={"csv/delimiter": ";", "csv/decimal": ","}
-        ),
+        "21": refused(decimal_commas, "decimal_comma", "a decimal comma", line=2, settings={"csv/delimiter": ";"}),
+        "21 profile": read(decimal_commas, settings={"csv/delimiter": ";", "csv/decimal": ","}),
         "22": refused(whole.replace(b",", b";"), "missing_column", "is the separator ';'", line=1),
         "22 auto": read(whole.replace(b",", b"\t"), "N-DELIM", settings={"csv/delimiter": "auto"}),
         "23": refused(cell("ERR"), "not_a_number", r"column accel_y_g \(accel_y\) is 'ERR'", line=7),
@@ -348,11 +343,9 @@ def cases() -> dict[str, Case]:
             "N-WRAP",
             settings={"csv/columns/time": {"column": "time_s", "unit": "counts", "counts_per_unit": 100.0}},
         ),
-        "33": refused(
-            text([*ROWS[:1500], *ROWS[200:1000]]), "time_back", "time goes back to 2 s after 14.99 s", line=1502
-        ),
+        "33": refused(from_earlier, "time_back", "time goes back to 2 s after 14.99 s", line=1502),
         "33 part of it twice": refused(
-            text([*ROWS[:1500], *ROWS[200:1000]]),
+            from_earlier,
             "time_back",
             "lines 1502 to 2301 repeat lines 202 to 1001 exactly: delete them; the log has 2 parts, lines 2 to 15",
             line=1502,
@@ -362,21 +355,14 @@ def cases() -> dict[str, Case]:
         "33 a block twice that differs": refused(
             text([*ROWS[:1500], *ROWS[1480:1499], ROWS[1499] + "9", *ROWS[1500:]]), "time_back", "goes back"
         ),
-        "33 session": read(
-            text([*ROWS[:1500], *ROWS[200:1000]]), "N-SESSION", kept=ALL[200:1000], settings={"csv/session": 2}
-        ),
+        "33 session": read(from_earlier, "N-SESSION", kept=ALL[200:1000], settings={"csv/session": 2}),
         "10 and a restart": refused(
-            text([*ROWS[:1500], "rst cause:2", "boot", *ROWS[200:1000]]),
+            rebooted,
             "bad_row",
             "1 more such lines.*Also line 1504: time goes back.*2 parts, lines 2 to 1501; 1504 to 2303",
             line=1502,
         ),
-        "33 session and text": read(
-            text([*ROWS[:1500], "rst cause:2", "boot", *ROWS[200:1000]]),
-            "N-SESSION",
-            kept=ALL[200:1000],
-            settings={"csv/session": 2},
-        ),
+        "33 session and text": read(rebooted, "N-SESSION", kept=ALL[200:1000], settings={"csv/session": 2}),
         "34": read(text(reordered()), "N-SORT", flags={700: NEVER_DIES, 701: NEVER_DIES}),
         "35 same": read(text([*ROWS[:10], *ROWS[9:]]), "N-DUP"),
         "35 different": refused(
