@@ -42,7 +42,7 @@ import pandas as pd
 from imu_research.figures import share, write_figures
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import CYCLE_DEGC, NOISES, StudyCase, draw
-from imu_research.study.run import errors_with
+from imu_research.study.run import errors_with, read_lines
 from pipeline.app.one_unit import ConfiguredUnit, unit_of_recordings
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS, Recording
@@ -277,7 +277,7 @@ def main() -> None:
     parser.add_argument("--figures", type=Path, help="file for the shares with their 95 % intervals")
     parser.add_argument("--depth", default="standard", choices=("standard", "full"))
     arguments = parser.parse_args()
-    lines = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.is_file() else []
+    lines = read_lines(arguments.out)
     done, of = {line["number"] for line in lines}, {"hidden": hidden, "null": null}[arguments.what]
     with arguments.out.open("a", encoding="utf-8") as file:
         for number in range(arguments.first, arguments.first + arguments.n):
