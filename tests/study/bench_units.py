@@ -69,12 +69,12 @@ def drawn(
             seats[name] = size * rng.uniform(0.0, 1.0) * direction / np.linalg.norm(direction)
     leans = coverage and kind == "single"  # as the table states; seats contain it
     bench: dict[str, Any] = {
-        "direction_deg": np.zeros((3, 2)).tolist() if KINDS[kind] == "single" and not leans else None,
         "rate_error": [0.0, 0.0, 0.0],  # encoders keep the angle over any number of turns; see ``judged``
         "mounting_deg": {n: (face * Rotation.from_rotvec(s, degrees=True)).as_rotvec(degrees=True).tolist()
                          for n, s in seats.items()},
     }  # fmt: skip
-    bench = {key: value for key, value in bench.items() if value is not None}
+    if KINDS[kind] == "single" and not leans:
+        bench["direction_deg"] = np.zeros((3, 2)).tolist()
     if "remounted" in kind:
         bench |= {
             "sense": int(rng.choice([-1, 1])),
