@@ -90,16 +90,11 @@ def values_of(sensor: str, name: str, rng: np.random.Generator) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Session:
-    """What to simulate.
-
-    Attributes
-    ----------
-    effects : sensor to effect to values.
-    """
+    """What to simulate."""
 
     seed: int = 0
     course: Course = STOP_AND_GO
-    effects: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    effects: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)  # sensor to effect to values
     white: float = 1.0
     wander: float = 1.0
     interval: float = 0.12

@@ -40,21 +40,7 @@ class Truth:
 
 @dataclass
 class Copy:
-    """A unit: good at first, then corrupted in one or two ways.
-
-    Attributes
-    ----------
-    causes : set of str
-        Effects of which one may truthfully be named as the cause of what was changed.
-    unseen : str
-        Why no logged channel reveals the change; empty where one does.
-    harmless : bool
-        Whether the change leaves all results right, so that a refusal would be needless.
-    leaked : bool
-        Whether the held-out motion shares samples with a fit.
-    said : dict
-        What was drawn at random, for the report.
-    """
+    """A unit: good at first, then corrupted in one or two ways."""
 
     name: str
     base: str
@@ -67,12 +53,12 @@ class Copy:
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
     row: dict[str, str] = field(default_factory=dict)
     overrides: list[str] = field(default_factory=list)
-    causes: set[str] = field(default_factory=set)
-    unseen: str = ""
-    harmless: bool = False
-    leaked: bool = False
+    causes: set[str] = field(default_factory=set)  # effects that may truthfully be named for what was changed
+    unseen: str = ""  # why no logged channel reveals the change; empty where one does
+    harmless: bool = False  # whether the change leaves all results right, so that a refusal would be needless
+    leaked: bool = False  # whether the held-out motion shares samples with a fit
     log_stamps: dict[str, float] = field(default_factory=dict)  # MCAP: seconds added to the stamps of a kind of message
-    said: dict[str, Any] = field(default_factory=dict)
+    said: dict[str, Any] = field(default_factory=dict)  # what was drawn at random, for the report
     way: str = ""
     kind: str = ""
 

@@ -31,23 +31,13 @@ class RandomField:
 
 @dataclass(frozen=True)
 class RandomLog:
-    """A log of random messages.
+    """A log of random messages."""
 
-    Attributes
-    ----------
-    before, between, inner : tuple of RandomField
-        Fields around the three that are read, and those of a type within.
-    wanted : tuple of str
-        Types of the three fields that are read.
-    alike : bool
-        Whether texts and sequences have the same lengths in all messages.
-    """
-
-    before: tuple[RandomField, ...]
-    between: tuple[RandomField, ...]
-    inner: tuple[RandomField, ...]
-    wanted: tuple[str, ...]
-    alike: bool
+    before: tuple[RandomField, ...]  # fields before the three that are read
+    between: tuple[RandomField, ...]  # after the first of them
+    inner: tuple[RandomField, ...]  # of a type within
+    wanted: tuple[str, ...]  # types of the three fields that are read
+    alike: bool  # whether texts and sequences have the same lengths in all messages
     messages: int
     seed: int
     chunk_size: int

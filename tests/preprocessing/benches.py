@@ -23,19 +23,13 @@ RATE = np.concatenate([np.zeros(40), *[np.append(np.full(50, r), np.zeros(20)) f
 
 @dataclass(frozen=True)
 class Setup:
-    """How a turn is mounted: what points up where the table shows ``zero``, and which way the angle counts.
-
-    Attributes
-    ----------
-    seat : (3,) array, deg
-        Rotation of the unit in its seat, body frame.
-    """
+    """How a turn is mounted: what points up where the table shows ``zero``, and which way the angle counts."""
 
     axis: str
     up: str = ""
     sense: int = 1
     zero: float = 0.0
-    seat: Any = (0.0, 0.0, 0.0)
+    seat: Any = (0.0, 0.0, 0.0)  # (3,), deg: rotation of the unit in its seat, body frame
 
     def recording(self, role: str, seed: int = 0, noise: float = 1.0) -> Recording:
         turned = STEPS if role == "accelerometer" else np.cumsum(RATE) * INTERVAL_S
