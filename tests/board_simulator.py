@@ -134,20 +134,20 @@ def table_path(axis: str, rates: Sequence[float], rate: float, turn_s: float = 4
             knots.append((knots[-1][0] + length, end))
     at, w = np.array(knots).T
 
+    lengths, changes = np.diff(at), np.diff(w)
+    angles = np.append(0.0, np.cumsum(lengths * (w[:-1] + 0.5 * changes)))
+
+    def place(x: Array) -> tuple[Array, Array]:
+        k = np.clip(np.searchsorted(at, x, side="right") - 1, 0, len(at) - 2)
+        return k, np.clip((x - at[k]) / lengths[k], 0.0, 1.0)
+
     def smooth_rate(x: Array) -> Array:
-        k = np.clip(np.searchsorted(at, x, side="right") - 1, 0, len(at) - 2)
-        s = np.clip((x - at[k]) / (at[k + 1] - at[k]), 0.0, 1.0)
-        return w[k] + (w[k + 1] - w[k]) * s * s * (3.0 - 2.0 * s)
+        k, s = place(x)
+        return w[k] + changes[k] * s * s * (3.0 - 2.0 * s)
 
-    k_angle = np.zeros(len(at))
-    for k in range(len(at) - 1):  # the integral of 3 s^2 - 2 s^3 is s^3 - s^4 / 2
-        k_angle[k + 1] = k_angle[k] + (at[k + 1] - at[k]) * (w[k] + (w[k + 1] - w[k]) * 0.5)
-
-    def angle_at(x: Array) -> Array:
-        k = np.clip(np.searchsorted(at, x, side="right") - 1, 0, len(at) - 2)
-        length = at[k + 1] - at[k]
-        s = np.clip((x - at[k]) / length, 0.0, 1.0)
-        return k_angle[k] + length * (w[k] * s + (w[k + 1] - w[k]) * (s**3 - 0.5 * s**4))
+    def angle_at(x: Array) -> Array:  # the integral of 3 s^2 - 2 s^3 is s^3 - s^4 / 2
+        k, s = place(x)
+        return angles[k] + lengths[k] * (w[k] * s + changes[k] * (s**3 - 0.5 * s**4))
 
     j = "xyz".index(axis)
     up = np.array(UP[axis], float)
