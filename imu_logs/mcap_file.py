@@ -95,7 +95,7 @@ class ChannelMessages:
         """Return all messages as an array of a structured type; they must have the size of that type."""
         if self.stride:
             return np.ndarray(len(self.starts), layout, self.data.data, int(self.starts[0]), (self.stride,))
-        return np.asarray(sliding_window_view(self.data, layout.itemsize)[self.starts].view(layout)[:, 0])
+        return _records(self.data, self.starts, layout)
 
 
 @dataclass
@@ -161,7 +161,7 @@ def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[ChannelMessages]
     if starts is None:
         starts, more = _followed(run.data, first)
         others += more
-    heads = _heads(data, starts)
+    heads = _records(data, starts, HEAD)
     rows = []
     for channel in np.unique(heads["channel"]).tolist():
         mask = heads["channel"] == channel
@@ -217,14 +217,14 @@ def _indexed(run: Run, data: NDArray[np.uint8], first: int) -> Integers | None:
     starts = np.sort(np.concatenate(list(run.index.values())))
     if not (len(starts) and starts[0] == first and starts[-1] + HEAD.itemsize <= len(data)):
         return None
-    heads = _heads(data, starts)
+    heads = _records(data, starts, HEAD)
     fitting = (heads["opcode"] == Opcode.MESSAGE) & (heads["length"] >= MESSAGE_HEAD) & (heads["length"] <= len(data))
     ends = starts + RECORD_HEAD + heads["length"].astype(np.int64)
     return starts if fitting.all() and np.array_equal(ends, np.append(starts[1:], len(data))) else None
 
 
-def _heads(data: NDArray[np.uint8], starts: Integers) -> NDArray[np.void]:
-    return np.asarray(sliding_window_view(data, HEAD.itemsize)[starts].view(HEAD)[:, 0])
+def _records(data: NDArray[np.uint8], starts: Integers, layout: np.dtype[np.void]) -> NDArray[np.void]:
+    return np.asarray(sliding_window_view(data, layout.itemsize)[starts].view(layout)[:, 0])
 
 
 class _Content(ReadDataStream):
