@@ -219,6 +219,14 @@ int main(void) {
 """
 
 
+def write_header(calibration: Path) -> None:
+    """Write the C header of a calibration beside it."""
+    from pipeline.output.exports import ExportedUnit, export  # noqa: PLC0415
+
+    files = export("calibration.h", ExportedUnit(json.loads(calibration.read_text()), {}))
+    calibration.with_name("calibration.h").write_text(files["calibration.h"])
+
+
 def in_c(folder: Path, real: str) -> float:
     """Return the CPU time of a sample in C, us."""
     (folder / "loop.c").write_text(C_LOOP)
@@ -229,7 +237,6 @@ def in_c(folder: Path, real: str) -> float:
 
 def samples_by_themselves(folder: Path, count: int = 3000) -> None:
     """Time a sample by itself, in an array, and in C."""
-    from pipeline.output.exports import ExportedUnit, export  # noqa: PLC0415
     from pipeline.physics.compensation import load  # noqa: PLC0415
 
     generator = np.random.default_rng(0)
@@ -239,10 +246,7 @@ def samples_by_themselves(folder: Path, count: int = 3000) -> None:
     print("CPU us a sample: by itself, in an array, in C (double, float)")
     for name, effects in EFFECTS.items():
         write_calibration(folder / "U1.json", effects)
-        header = export("calibration.h", ExportedUnit(json.loads((folder / "U1.json").read_text()), {}))[
-            "calibration.h"
-        ]
-        (folder / "calibration.h").write_text(header)
+        write_header(folder / "U1.json")
         compensation = load(folder / "U1.json")
         stream = compensation.stream()
         start = time.process_time()

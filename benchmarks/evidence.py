@@ -215,9 +215,7 @@ def main() -> int:
         found = measured(known[name], options)
         print(f"{name}: {(time.time() - began) / 60.0:.1f} min", flush=True)
         for figure in found.figures:
-            print(
-                "  " + " ".join(str(cell) for cell in figure.cells) + (" MISSED" if figure.missed else ""), flush=True
-            )
+            print(" ", *figure.cells, *["MISSED"] * figure.missed, flush=True)
         if options.share < 1.0:
             wrong += [f"{name}: {line}" for line in outside(Stored.of(name), found)]
         else:

@@ -59,9 +59,8 @@ def replicate(source: Path, names: list[str], target: Path, rng: np.random.Gener
                 unit, files = known[i % len(known)], {}
                 for member in members[stage, unit]:
                     text = pack.read(member).decode().replace(unit, name)
-                    files[member.replace(unit, name)] = (
-                        _scattered(text, rng) if stage == "calibration" else text.encode()
-                    )
+                    content = _scattered(text, rng) if stage == "calibration" else text.encode()
+                    files[member.replace(unit, name)] = content
                 add(files)
 
 

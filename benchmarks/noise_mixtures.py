@@ -139,9 +139,8 @@ def long_enough(n: int, dt: float, terms: list[Term]) -> bool:
     if (best.kinds, best.columns) != (kinds, columns):
         return False
     for other in search.found.values():
-        gain = (
-            other.bic - best.bic + penalty * (count_of(best.kinds, best.columns) - count_of(other.kinds, other.columns))
-        )
+        fewer = count_of(best.kinds, best.columns) - count_of(other.kinds, other.columns)
+        gain = other.bic - best.bic + penalty * fewer
         if other is not best and other.bic - best.bic < 2.0 * SURE * np.sqrt(max(gain, 0.0)):
             return False
     return True
