@@ -47,7 +47,7 @@ def small(folder: Path, units: int) -> Path:
 def replicate(source: Path, names: list[str], target: Path, rng: np.random.Generator) -> None:
     """Write the packs of a batch of these names from those of other units."""
     packs = {stage: Pack(source / f"{stage}.zip") for stage in PACKED_STEPS}
-    known = [n.removesuffix(".json") for n in packs["calibration"].names()]
+    known = [n.removesuffix(".json") for n in packs["calibration"].names() if n.endswith(".json")]
     members = {
         (stage, unit): [n for n in pack.names() if n.partition("/")[0].startswith(unit) or f"/{unit}." in n]
         for stage, pack in packs.items()
@@ -59,7 +59,8 @@ def replicate(source: Path, names: list[str], target: Path, rng: np.random.Gener
                 unit, files = known[i % len(known)], {}
                 for member in members[stage, unit]:
                     text = pack.read(member).decode().replace(unit, name)
-                    content = _scattered(text, rng) if stage == "calibration" else text.encode()
+                    scattered = stage == "calibration" and member.endswith(".json")
+                    content = _scattered(text, rng) if scattered else text.encode()
                     files[member.replace(unit, name)] = content
                 add(files)
 
