@@ -40,7 +40,7 @@ SHEETS = {  # campaign that ships, and its unit
     "published mpu6050": "mpu6050",
     "published wearable": "wearable",
 }
-UNTIL = ("ingest", "filter", "fit", "validate", "calibration")
+UNTIL = ("ingest", "filter", "fit", "validate", "diagnose", "calibration")
 MANY_U, MANY_FLOORS = 5.0, 3.0
 Rows = list[list[str]]
 
