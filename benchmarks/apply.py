@@ -14,13 +14,13 @@ import argparse
 import importlib
 import json
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from measuring import in_own_process
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -115,13 +115,6 @@ def csv_unchanged(log: Path, out: Path, _calibration: Path) -> int:
     return rows
 
 
-def csv_applied(log: Path, out: Path, calibration: Path) -> int:
-    from pipeline.app.field_logs.stream import compensate_log  # noqa: PLC0415
-    from pipeline.physics.compensation import load  # noqa: PLC0415
-
-    return compensate_log(load(calibration), log, out).samples
-
-
 def mcap_unchanged(log: Path, out: Path, _calibration: Path) -> int:
     import zstandard  # noqa: PLC0415
     from mcap.opcode import Opcode  # noqa: PLC0415
@@ -144,7 +137,7 @@ def mcap_unchanged(log: Path, out: Path, _calibration: Path) -> int:
     return reader.count
 
 
-def mcap_applied(log: Path, out: Path, calibration: Path) -> int:
+def applied(log: Path, out: Path, calibration: Path) -> int:
     from pipeline.app.field_logs.stream import compensate_log  # noqa: PLC0415
     from pipeline.physics.compensation import load  # noqa: PLC0415
 
@@ -172,9 +165,9 @@ def mcap_official(log: Path, out: Path, _calibration: Path, most: int = 200_000)
 
 WAYS: dict[str, Callable[[Path, Path, Path], int]] = {
     "csv unchanged": csv_unchanged,
-    "csv applied": csv_applied,
+    "csv applied": applied,
     "mcap unchanged": mcap_unchanged,
-    "mcap applied": mcap_applied,
+    "mcap applied": applied,
     "mcap official": mcap_official,
 }
 MODULES = {
@@ -201,8 +194,7 @@ def run_once(way: str, log: str, out: str, calibration: str) -> None:
 
 
 def measure(way: str, log: Path, out: Path, calibration: Path) -> dict[str, float]:
-    command = [sys.executable, __file__, "--run", way, str(log), str(out), str(calibration)]
-    found: dict[str, float] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    found = in_own_process(__file__, "--run", way, str(log), str(out), str(calibration))
     print(f"{way:16}", ", ".join(f"{key} {value:,.4g}" for key, value in found.items()), flush=True)
     return found
 
@@ -227,6 +219,14 @@ int main(void) {
 """
 
 
+def write_header(calibration: Path) -> None:
+    """Write the C header of a calibration beside it."""
+    from pipeline.output.exports import ExportedUnit, export  # noqa: PLC0415
+
+    files = export("calibration.h", ExportedUnit(json.loads(calibration.read_text()), {}))
+    calibration.with_name("calibration.h").write_text(files["calibration.h"])
+
+
 def in_c(folder: Path, real: str) -> float:
     """Return the CPU time of a sample in C, us."""
     (folder / "loop.c").write_text(C_LOOP)
@@ -237,7 +237,6 @@ def in_c(folder: Path, real: str) -> float:
 
 def samples_by_themselves(folder: Path, count: int = 3000) -> None:
     """Time a sample by itself, in an array, and in C."""
-    from pipeline.output.exports import ExportedUnit, export  # noqa: PLC0415
     from pipeline.physics.compensation import load  # noqa: PLC0415
 
     generator = np.random.default_rng(0)
@@ -247,10 +246,7 @@ def samples_by_themselves(folder: Path, count: int = 3000) -> None:
     print("CPU us a sample: by itself, in an array, in C (double, float)")
     for name, effects in EFFECTS.items():
         write_calibration(folder / "U1.json", effects)
-        header = export("calibration.h", ExportedUnit(json.loads((folder / "U1.json").read_text()), {}))[
-            "calibration.h"
-        ]
-        (folder / "calibration.h").write_text(header)
+        write_header(folder / "U1.json")
         compensation = load(folder / "U1.json")
         stream = compensation.stream()
         start = time.process_time()

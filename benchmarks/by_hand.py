@@ -10,20 +10,16 @@ from __future__ import annotations
 
 import argparse
 import os
-import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from measuring import least
 
 from pipeline.app.one_unit import unit_row
 from pipeline.ingest.read import read_recordings
 from pipeline.unit import Task, UnitState, run_checked, run_steps
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 
 LAYERS = [
     "sensor=generic", "table=hand", "procedure=multi_position", "ingest=xsens_mti_multi_position",
@@ -32,18 +28,7 @@ LAYERS = [
 METHOD = {"accelerometer": ["nonlinear_least_squares"], "gyroscope": ["rests_and_moves"]}
 
 
-def least(times: int, work: Callable[[], Any]) -> tuple[float, Any]:
-    """Return the least CPU time of some runs, s, and the last result."""
-    found, result = [], None
-    for _ in range(times):
-        began = time.process_time()
-        result = work()
-        found.append(time.process_time() - began)
-    return min(found), result
-
-
 def main() -> None:
-    """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--times", type=int, default=5)

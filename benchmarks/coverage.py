@@ -32,6 +32,7 @@ import numpy as np
 
 from imu_research.figures import clustered_share, write_figures
 from pipeline.core.records import SENSORS, NotCalibrated
+from pipeline.output.exports.sensors import rotation_times_lower
 from pipeline.physics.effects.base import truth
 from pipeline.physics.kinematics import reference_motion
 from pipeline.simulation.campaign import simulate_unit
@@ -39,8 +40,6 @@ from pipeline.simulation.description import UnitDescription, shipped_settings
 from pipeline.unit import run_checked
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from pipeline.core.records import Recording, SensorCalibration
     from pipeline.core.settings import Settings
 
@@ -121,13 +120,6 @@ def noise_free(recordings: list[Recording], sensor: str, hidden: JSON) -> list[R
     return out
 
 
-def frame_of(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation Q of ``matrix = Q L``, L lower triangular: the frame of a fit without a table."""
-    flipped, _ = np.linalg.qr(matrix[:, ::-1])
-    Q = flipped[:, ::-1]
-    return Q * np.sign(np.diag(Q.T @ matrix))
-
-
 def true_values(method: str, recordings: list[Recording], settings: Settings, hidden: JSON) -> np.ndarray:
     _, sensor, stages = METHODS[method]
     matrix = np.array(hidden[sensor]["matrix"])
@@ -138,7 +130,8 @@ def true_values(method: str, recordings: list[Recording], settings: Settings, hi
             APPROXIMATIONS[unit] = np.concatenate([found.bias, found.matrix.ravel()])
         return APPROXIMATIONS[unit]
     if method.endswith("by hand") or "nonlinear" in method:
-        matrix = frame_of(np.array(hidden["accelerometer"]["matrix"])).T @ matrix
+        frame, _ = rotation_times_lower(np.array(hidden["accelerometer"]["matrix"]))  # of a fit without a table
+        matrix = frame.T @ matrix
     return np.concatenate([hidden[sensor]["bias"], matrix.ravel()])
 
 
@@ -169,12 +162,6 @@ def study(methods: list[str], condition: str, number: int, seed: int, table: str
     return found
 
 
-def joined(units: Iterable[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return the rows of all units, by method."""
-    found = list(units)
-    return {name: np.array([each[name] for each in found]) for name in found[0]}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, default=1000)
@@ -194,9 +181,10 @@ def main() -> None:
         units = range(arguments.first, arguments.first + arguments.n)
         of_unit = partial(study, methods, condition, seed=arguments.seed, table=arguments.table)
         with ProcessPoolExecutor(arguments.processes, get_context("spawn")) as pool:
-            found = joined(pool.map(of_unit, units, chunksize=4))
+            found = list(pool.map(of_unit, units, chunksize=4))
         print(f"{condition}, n = {arguments.n}, seed {arguments.seed}, {time.monotonic() - start:.0f} s")
-        for name, ratios in found.items():
+        for name in found[0]:
+            ratios = np.array([unit[name] for unit in found])
             known = ~np.all(np.isnan(ratios), axis=0)
             inside = np.abs(ratios[:, known]) <= 1.0
             figures += clustered_share(f"{name}, {condition}", list(inside), "contains 95 %")
@@ -207,8 +195,7 @@ def main() -> None:
                 f"parameters {each.min():5.1f} to {each.max():5.1f} %: {' '.join(f'{e:.1f}' for e in each)}",
                 flush=True,
             )
-    if arguments.figures:
-        write_figures(arguments.figures, figures)
+    write_figures(arguments.figures, figures)
 
 
 if __name__ == "__main__":

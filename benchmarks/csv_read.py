@@ -13,7 +13,6 @@ import hashlib
 import importlib
 import json
 import resource
-import subprocess
 import sys
 import tempfile
 import time
@@ -21,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+from measuring import in_own_process
 from pyarrow import csv
 
 NAMES = (
@@ -91,14 +91,6 @@ def read_hash(path: Path) -> tuple[int, list[float]]:
 READERS = {"bare": read_bare, "ours": read_ours, "hash": read_hash, "marked": read_marked}
 
 
-def measure(reader: str, path: Path) -> dict[str, float]:
-    """Read in a process of its own."""
-    command = [sys.executable, __file__, "--read", reader, str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    found: dict[str, float] = json.loads(done.stdout)
-    return found
-
-
 def read_once(reader: str, path: Path) -> None:
     if reader != "bare":
         importlib.import_module("pipeline.ingest.read")
@@ -127,7 +119,8 @@ def main() -> None:
         print(f"{options.rows} x {len(NAMES)}, {path.stat().st_size / 1e6:.1f} MB")
         ratios: dict[str, list[float]] = {}
         for _ in range(options.repeat):
-            found = {r: measure(r, path) for r in ("bare", "ours", "hash", *(["marked"] if options.marks else []))}
+            readers = ("bare", "ours", "hash", *(["marked"] if options.marks else []))
+            found = {r: in_own_process(__file__, "--read", r, str(path)) for r in readers}
             if not np.allclose(found["bare"]["last"], found["ours"]["last"], rtol=1e-13):
                 sys.exit("the readers differ")
             for name, figures in found.items():

@@ -74,12 +74,10 @@ class Stored:
 
     @classmethod
     def of(cls, name: str) -> Self:
-        """Read a stored measure."""
         document = json.loads((FOLDER / "stored" / f"{name}.json").read_text(encoding="utf-8"))
         return cls(**{**document, "figures": [MeasuredFigure.from_json(f) for f in document["figures"]]})
 
     def write(self, name: str) -> None:
-        """Store it."""
         document = {**asdict(self), "figures": [figure.to_json() for figure in self.figures]}
         text = json.dumps(document, indent=1) + "\n"
         (FOLDER / "stored" / f"{name}.json").write_text(text, encoding="utf-8")
@@ -101,7 +99,6 @@ class Stored:
 
 
 def measures() -> dict[str, Measure]:
-    """Return the measures by name."""
     listed: Mapping[str, Mapping[str, object]] = yaml.safe_load((FOLDER / "measures.yaml").read_text(encoding="utf-8"))
     return {name: Measure(**values) for name, values in listed.items()}
 
@@ -191,7 +188,6 @@ def stated(figure: MeasuredFigure) -> str:
 
 
 def ratio(figure: MeasuredFigure) -> str:
-    """Return a ratio with its interval."""
     return f"{figure.value:.3g} ({ends(figure)})"
 
 
@@ -201,7 +197,6 @@ def ends(figure: MeasuredFigure) -> str:
 
 
 def main() -> int:
-    """Run it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "page"))
     parser.add_argument("names", nargs="*", help="measures; all by default")
@@ -220,9 +215,7 @@ def main() -> int:
         found = measured(known[name], options)
         print(f"{name}: {(time.time() - began) / 60.0:.1f} min", flush=True)
         for figure in found.figures:
-            print(
-                "  " + " ".join(str(cell) for cell in figure.cells) + (" MISSED" if figure.missed else ""), flush=True
-            )
+            print(" ", *figure.cells, *["MISSED"] * figure.missed, flush=True)
         if options.share < 1.0:
             wrong += [f"{name}: {line}" for line in outside(Stored.of(name), found)]
         else:

@@ -77,7 +77,6 @@ atexit.register(_tell)
 
 
 def main() -> int:
-    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, default=100)
     parser.add_argument("--simulated", type=int, default=1000, help="most units with recordings of their own")
@@ -95,8 +94,7 @@ def main() -> int:
             _lay_out(folder, arguments.units, min(arguments.units, arguments.simulated), mixed)
         _run(folder, arguments.cores)
         figures = _report(folder, arguments.cores, ", mixed" * arguments.mixed)
-    if arguments.figures:
-        write_figures(arguments.figures, figures)
+    write_figures(arguments.figures, figures)
     return 0
 
 

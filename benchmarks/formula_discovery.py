@@ -42,7 +42,7 @@ import pandas as pd
 from imu_research.figures import share, write_figures
 from imu_research.study.bench import recordings_of
 from imu_research.study.cases import CYCLE_DEGC, NOISES, StudyCase, draw
-from imu_research.study.run import errors_with
+from imu_research.study.run import errors_with, read_lines
 from pipeline.app.one_unit import ConfiguredUnit, unit_of_recordings
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS, Recording
@@ -91,8 +91,6 @@ def values(text: str, signals: JSON) -> np.ndarray:
 
 
 def drawn(rng: np.random.Generator, sensor: str, spans: dict[str, tuple[float, float]]) -> str:
-    """Draw one formula."""
-
     def one(options: Any) -> Any:  # noqa: ANN401
         return options[int(rng.integers(len(options)))]
 
@@ -129,8 +127,12 @@ def hide(case: StudyCase) -> tuple[list[Recording], str, list[float]]:
     used = [r.name for r in recordings if r.role in SENSORS]
     u = np.concatenate([signals[n]["u"] for n in used])
     base = np.column_stack([np.ones(len(u)), u])
-    spans = {s: _span(np.concatenate([signals[n][s] for n in used])) for s in ("temperature", "time", "speed")}
-    known = [(e, _columns(e, case.sensor, recordings, used)) for e in candidates_for(_observed(case, recordings), [])]
+    spans = {}
+    for name in ("temperature", "time", "speed"):
+        signal = np.concatenate([signals[n][name] for n in used])
+        spans[name] = (float(signal.min()), float(signal.max()))
+    observed = observe(case.sensor, recordings, shipped_settings(table="acutronic").table)
+    known = [_columns(effect, case.sensor, recordings, used) for effect in candidates_for(observed, [])]
     while True:
         text = drawn(rng, case.sensor, spans)
         added = np.concatenate([values(text, signals[n]) for n in used])
@@ -138,7 +140,7 @@ def hide(case: StudyCase) -> tuple[list[Recording], str, list[float]]:
         c = int(np.argmax(rms))
         if rms[c] < 0.05 * float(np.std(added[:, c])) or rms[c] < 1e-12 or WARM_UP.match(text):
             continue
-        shares = [1.0 - (left(added[:, c], np.column_stack([base, z[:, c]])) / rms[c]) ** 2 for _, z in known]
+        shares = [1.0 - (left(added[:, c], np.column_stack([base, z[:, c]])) / rms[c]) ** 2 for z in known]
         if max(shares) < 0.95:
             break
     size = (SIZE[case.sensor] / rms[c] * rng.uniform(0.7, 1.3, 3) * rng.choice([-1.0, 1.0], 3)).tolist()
@@ -147,14 +149,6 @@ def hide(case: StudyCase) -> tuple[list[Recording], str, list[float]]:
         extra = values(text, signals[r.name]) * size if signals[r.name] else 0.0
         out.append(replace(r, **{case.sensor: np.asarray(r.reading(case.sensor)) + extra}))
     return out, text, size
-
-
-def _span(signal: np.ndarray) -> tuple[float, float]:
-    return float(signal.min()), float(signal.max())
-
-
-def _observed(case: StudyCase, recordings: list[Recording]) -> Any:  # noqa: ANN401
-    return observe(case.sensor, recordings, shipped_settings(table="acutronic").table)
 
 
 def _columns(effect: Any, sensor: str, recordings: list[Recording], used: list[str]) -> np.ndarray:  # noqa: ANN401
@@ -274,7 +268,6 @@ def null(number: int, seed: int, depth: str) -> JSON:
 
 
 def main() -> None:
-    """Run what is asked for, and print the shares."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("hidden", "null"))
     parser.add_argument("out", type=Path)
@@ -284,7 +277,7 @@ def main() -> None:
     parser.add_argument("--figures", type=Path, help="file for the shares with their 95 % intervals")
     parser.add_argument("--depth", default="standard", choices=("standard", "full"))
     arguments = parser.parse_args()
-    lines = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.is_file() else []
+    lines = read_lines(arguments.out)
     done, of = {line["number"] for line in lines}, {"hidden": hidden, "null": null}[arguments.what]
     with arguments.out.open("a", encoding="utf-8") as file:
         for number in range(arguments.first, arguments.first + arguments.n):
@@ -302,8 +295,7 @@ def main() -> None:
         found = share("units with an invented formula", invented, "<= 1 %")
     for figure in found:
         print(*figure.cells)
-    if arguments.figures:
-        write_figures(arguments.figures, found)
+    write_figures(arguments.figures, found)
 
 
 if __name__ == "__main__":

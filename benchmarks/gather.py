@@ -37,19 +37,8 @@ print(used.ru_utime + used.ru_stime, int(largest) / 1024)
 
 def small(folder: Path, units: int) -> Path:
     """Run a campaign of some units and return its batches."""
-    run = [
-        sys.executable,
-        "-m",
-        "pipeline",
-        "simulate",
-        "small",
-        "--units",
-        str(units),
-        "--samples",
-        "10000",
-        "--quiet",
-    ]
-    subprocess.run(run, cwd=folder, check=True, stderr=subprocess.DEVNULL)
+    made = ["simulate", "small", "--units", str(units), "--samples", "10000", "--quiet"]
+    subprocess.run([sys.executable, "-m", "pipeline", *made], cwd=folder, check=True, stderr=subprocess.DEVNULL)
     command = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "-c2", "-q", "all"]
     subprocess.run([*command, "--config", "campaign=small"], cwd=folder, check=True)
     return next((folder / "results/small/batches").glob("*-0001"))
@@ -58,7 +47,7 @@ def small(folder: Path, units: int) -> Path:
 def replicate(source: Path, names: list[str], target: Path, rng: np.random.Generator) -> None:
     """Write the packs of a batch of these names from those of other units."""
     packs = {stage: Pack(source / f"{stage}.zip") for stage in PACKED_STEPS}
-    known = [n.removesuffix(".json") for n in packs["calibration"].names()]
+    known = [n.removesuffix(".json") for n in packs["calibration"].names() if n.endswith(".json")]
     members = {
         (stage, unit): [n for n in pack.names() if n.partition("/")[0].startswith(unit) or f"/{unit}." in n]
         for stage, pack in packs.items()
@@ -70,9 +59,9 @@ def replicate(source: Path, names: list[str], target: Path, rng: np.random.Gener
                 unit, files = known[i % len(known)], {}
                 for member in members[stage, unit]:
                     text = pack.read(member).decode().replace(unit, name)
-                    files[member.replace(unit, name)] = (
-                        _scattered(text, rng) if stage == "calibration" else text.encode()
-                    )
+                    scattered = stage == "calibration" and member.endswith(".json")
+                    content = _scattered(text, rng) if scattered else text.encode()
+                    files[member.replace(unit, name)] = content
                 add(files)
 
 
@@ -93,7 +82,6 @@ def spent(arguments: list[str]) -> tuple[float, float]:
 
 
 def main() -> int:
-    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, nargs="+", default=[10_000])
     parser.add_argument("--folder", type=Path)

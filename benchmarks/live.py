@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import json
 import tempfile
 import time
 from pathlib import Path
@@ -18,10 +17,9 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from apply import EFFECTS, in_c, write_calibration
+from apply import EFFECTS, in_c, write_calibration, write_header
 
 from pipeline.app.field_logs.ros2_node import MessageCalibrator
-from pipeline.output.exports import ExportedUnit, export
 from pipeline.physics.compensation import load
 
 if TYPE_CHECKING:
@@ -80,8 +78,7 @@ def main() -> None:
 
             print(f"| {title} | stream | {latencies(one, count)} |")
             print(f"| {title} | node | {latencies(received, count)} |")
-            header = export("calibration.h", ExportedUnit(json.loads(file.read_text()), {}))["calibration.h"]
-            (folder / "calibration.h").write_text(header)
+            write_header(file)
             print(f"| {title} | C | double {in_c(folder, 'double'):.3f}, float {in_c(folder, 'float'):.3f} us mean |")
 
 

@@ -96,7 +96,6 @@ class Lot:
 
 
 def row(lots: list[Lot], U: np.ndarray) -> JSON:
-    """Return the figures of some lots."""
     squares = np.array([[np.mean((e / U) ** 2) for e in lot.errors] for lot in lots])
     inside = np.array([[np.mean(np.abs(e) <= u) for e, u in zip(lot.errors, lot.U, strict=True)] for lot in lots])
     drawn = squares[np.random.default_rng(0).integers(0, len(lots), (2000, len(lots)))].mean(axis=1)

@@ -10,7 +10,6 @@ import argparse
 import importlib
 import json
 import resource
-import subprocess
 import sys
 import tempfile
 import time
@@ -18,8 +17,9 @@ from pathlib import Path
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from measuring import in_own_process
 
-from imu_logs.mcap_write import DEFINITIONS, IMU
+from imu_logs.mcap_write import DEFINITIONS, IMU, as_messages
 
 CHUNK = 1 << 20  # bytes
 LSB = 1 / 16384
@@ -29,8 +29,6 @@ COLUMNS = 6
 def write_log(path: Path, messages: int, compression: CompressionType) -> None:
     """Write Imu messages with quantised noise, frame imu_link, 324 bytes each."""
     generator = np.random.default_rng(1)
-    layout = np.dtype([("head", "V4"), ("sec", "<i4"), ("nanosec", "<u4"), ("frame", "V16"), ("numbers", "<f8", 37)])
-    frame = (9).to_bytes(4, "little") + b"imu_link\0" + bytes(3)
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=CHUNK, compression=compression)
         writer.start(profile="ros2")
@@ -40,12 +38,10 @@ def write_log(path: Path, messages: int, compression: CompressionType) -> None:
         for start in range(0, messages, 100_000):
             count = min(100_000, messages - start)
             stamps = 1_700_000_000_000_000_000 + 1_000_000 * np.arange(start, start + count)
-            table = np.zeros(count, layout)
-            table["head"], table["frame"] = b"\x00\x01\x00\x00", frame
-            table["sec"], table["nanosec"] = stamps // 10**9, stamps % 10**9
-            table["numbers"][:, 13:16] = np.rint(generator.normal(0, 100, (count, 3))) * LSB
-            table["numbers"][:, 25:28] = np.rint(generator.normal(0, 100, (count, 3))) * LSB
-            for stamp, row in zip(stamps.tolist(), table, strict=True):
+            numbers = np.zeros((count, 37))
+            for vector in (slice(13, 16), slice(25, 28)):  # angular velocity and acceleration
+                numbers[:, vector] = np.rint(generator.normal(0, 100, (count, 3))) * LSB
+            for stamp, row in zip(stamps.tolist(), as_messages(stamps, "imu_link", numbers), strict=True):
                 writer.add_message(channel, stamp, row.tobytes(), stamp)
         writer.finish()
 
@@ -75,14 +71,6 @@ def read_official(path: Path, messages: int) -> tuple[int, list[float]]:
     return len(columns[0]), [float(v[:1000].sum()) for v in values]
 
 
-def measure(reader: str, path: Path, messages: int) -> dict[str, float]:
-    """Read in a process of its own."""
-    command = [sys.executable, __file__, "--read", reader, str(path), "--messages", str(messages)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    found: dict[str, float] = json.loads(done.stdout)
-    return found
-
-
 def read_once(reader: str, path: Path, messages: int) -> None:
     read = {"ours": read_ours, "official": read_official}[reader]
     importlib.import_module({"ours": "imu_logs.message_read", "official": "mcap_ros2.reader"}[reader])
@@ -110,8 +98,11 @@ def main() -> None:
         print(f"{options.messages} sensor_msgs/Imu, {options.compression}, {path.stat().st_size / 1e6:.1f} MB")
         ratios = []
         for _ in range(options.repeat):
-            ours = measure("ours", path, options.messages)
-            official = measure("official", path, options.official_messages)
+            counts = {"ours": options.messages, "official": options.official_messages}
+            ours, official = (
+                in_own_process(__file__, "--read", reader, str(path), "--messages", str(count))
+                for reader, count in counts.items()
+            )
             if not np.allclose(ours.pop("sums"), official.pop("sums"), rtol=1e-13):
                 sys.exit("the readers differ")
             ratios.append(ours["per_cpu_s"] / official["per_cpu_s"])

@@ -24,9 +24,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import pandas as pd
 from scipy.signal import fftconvolve, lfilter
-from scipy.stats import beta
 
-from imu_research.figures import share, write_figures
+from imu_research.figures import clopper_pearson, share, write_figures
 from pipeline.core.records import Recording
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_search import CompositionSearch, best_of, count_of
@@ -81,7 +80,6 @@ def drawn(rng: np.random.Generator) -> tuple[int, float, list[Term]]:
 
 
 def simulated(rng: np.random.Generator, n: int, dt: float, terms: list[Term]) -> Values:
-    """Return n samples of a mixture."""
     out, t = np.zeros(n), np.arange(n) * dt
     for letter, size, *more in terms:
         white = rng.standard_normal(n)
@@ -141,9 +139,8 @@ def long_enough(n: int, dt: float, terms: list[Term]) -> bool:
     if (best.kinds, best.columns) != (kinds, columns):
         return False
     for other in search.found.values():
-        gain = (
-            other.bic - best.bic + penalty * (count_of(best.kinds, best.columns) - count_of(other.kinds, other.columns))
-        )
+        fewer = count_of(best.kinds, best.columns) - count_of(other.kinds, other.columns)
+        gain = other.bic - best.bic + penalty * fewer
         if other is not best and other.bic - best.bic < 2.0 * SURE * np.sqrt(max(gain, 0.0)):
             return False
     return True
@@ -172,8 +169,7 @@ SECOND = {"gauss_markov": "correlation_time_s", "sinusoid": "frequency_hz"}
 
 def interval(k: int, n: int) -> str:
     """Return the 95 % interval of a share by Clopper and Pearson."""
-    low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
-    high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
+    low, high = clopper_pearson(k, n) if n else (0.0, 1.0)
     return f"{k} of {n}: {100 * k / max(n, 1):.1f} % ({100 * low:.1f} to {100 * high:.1f} %)"
 
 
@@ -208,29 +204,21 @@ def main() -> None:
         elif enough:
             wrong[" ".join(truth), " ".join(got)] += 1
             if options.verbose:
-                print(
-                    n,
-                    dt,
-                    terms,
-                    got,
-                    [(r["terms"], round(r["delta_bic"], 1)) for r in found["ranking"][:4]],
-                    flush=True,
-                )
+                best = [(r["terms"], round(r["delta_bic"], 1)) for r in found["ranking"][:4]]
+                print(n, dt, terms, got, best, flush=True)
     print(f"mixtures drawn: {drawn_total}; CPU of the identification, s an axis: {spent / drawn_total:.3f}")
     print("right composition, long enough:", interval(sum(right), len(right)))
     print("right composition, the others:", interval(sum(short_right), len(short_right)))
     told(covered)
     print("upper limits that hold:", interval(sum(limits), len(limits)))
-    if options.figures:
-        held = [v for (_, enough), values in covered.items() if enough for v in values]
-        shares = share("composition of the noise is right", pd.Series(right), ">= 95 %")
-        write_figures(options.figures, [*shares, *share("intervals that hold the truth", pd.Series(held), ">= 95 %")])
+    held = [v for (_, enough), values in covered.items() if enough for v in values]
+    shares = share("composition of the noise is right", pd.Series(right), ">= 95 %")
+    write_figures(options.figures, [*shares, *share("intervals that hold the truth", pd.Series(held), ">= 95 %")])
     for (expected, got), k in wrong.most_common(15):
         print(f"  {k}: {expected} -> {got}")
 
 
 def told(covered: dict[tuple[str, bool], list[bool]]) -> None:
-    """Print the shares of intervals that cover."""
     for enough in (True, False):
         every = [v for (_, e), values in covered.items() if e == enough for v in values]
         print(f"intervals that cover, {'long enough' if enough else 'the others'}:", interval(sum(every), len(every)))
@@ -239,7 +227,6 @@ def told(covered: dict[tuple[str, bool], list[bool]]) -> None:
 
 
 def axis_of(values: Values, dt: float) -> dict[str, Any]:
-    """Return the noise that is identified in one axis."""
     zero = np.zeros_like(values)
     time_ns = np.rint(np.arange(len(values)) * dt * 1e9).astype(np.int64)
     recording = Recording("static", "static", None, time_ns, gyroscope=np.stack([values, zero, zero], axis=1))

@@ -24,6 +24,7 @@ from imu_research.figures import MeasuredFigure, clustered_share, share, write_f
 from pipeline.app.one_unit import unit_of_recordings, unit_row
 from pipeline.core.records import SENSORS, Recording
 from pipeline.estimation.uncertainty_budget import limited_effects
+from pipeline.output.exports.sensors import rotation_times_lower
 from pipeline.physics.effects.base import REFERENCE_TEMPERATURE
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
@@ -38,13 +39,6 @@ PROCEDURES = {
     "multi_position": {"interval_s": 0.02},
     "three_axis_turns": {"table": "acutronic"},
 }
-
-
-def _lower(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation Q of ``matrix = Q L``, L lower triangular: L is the matrix in the frame of the method."""
-    flipped, _ = np.linalg.qr(matrix[:, ::-1])
-    Q = flipped[:, ::-1]
-    return Q * np.sign(np.diag(Q.T @ matrix))
 
 
 def _at_mean_temperature(truth: dict, effect: str, slope: list[float], recordings: list[Recording]) -> dict:
@@ -77,7 +71,8 @@ def errors_of(procedure: str, effect: str, limit: np.ndarray | None, seed: int) 
         if part is None:
             continue
         if procedure in WITHOUT_CASE:
-            true = true | {"matrix": _lower(np.array(truth["accelerometer"]["matrix"])).T @ np.array(true["matrix"])}
+            frame, _ = rotation_times_lower(np.array(truth["accelerometer"]["matrix"]))  # of the method
+            true = true | {"matrix": frame.T @ np.array(true["matrix"])}
         flat = [np.append(p["bias"], np.ravel(p["matrix"])) for p in (part, true, part["expanded_uncertainty"])]
         wide = part["uncertainty_with_open"]
         wide = np.append(wide["bias"], np.ravel(wide["matrix"]))
@@ -115,7 +110,6 @@ def at_limits() -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, default=1, help="of each effect")
     parser.add_argument("--procedure", nargs="+", default=list(PROCEDURES), choices=list(PROCEDURES))
@@ -155,8 +149,7 @@ def main() -> None:
             print(f"   {r['sensor']} with {r['effect']}: {said}, line {'yes' if r['line'].any() else 'no'}")
         causes = sorted({(r["sensor"][:4], r["effect"], r["verdict"], ",".join(r["selected"])) for r in told})
         print("   told:", causes if options.told else len(told), flush=True)
-    if options.figures:
-        write_figures(options.figures, figures)
+    write_figures(options.figures, figures)
 
 
 if __name__ == "__main__":

@@ -11,11 +11,11 @@ import argparse
 import shutil
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from measuring import least
 
 from pipeline.app.config import load_campaign
 from pipeline.app.one_unit import unit_of_campaign
@@ -25,8 +25,6 @@ from pipeline.output.pages import campaign_page
 from pipeline.unit import Task, run_step
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from playwright.sync_api import CDPSession
 
 UNIT = "mpu6050-2-hidden"
@@ -39,17 +37,6 @@ FILTER = """(() => {
 DRAWN = "new Promise((done) => requestAnimationFrame(() => setTimeout(done, 0)))"
 
 
-def least(work: Callable[[], object], runs: int) -> float:
-    """Return the least CPU time of a call, ms."""
-    work()
-    took = []
-    for _ in range(runs):
-        start = time.process_time()
-        work()
-        took.append(time.process_time() - start)
-    return 1e3 * min(took)
-
-
 def unit_costs(runs: int) -> dict[str, float]:
     """Return CPU milliseconds of what is made of one unit."""
     unit = unit_of_campaign(load_campaign({"campaign": "demo"}), UNIT)
@@ -57,10 +44,11 @@ def unit_costs(runs: int) -> dict[str, float]:
     settings, fits = unit.settings(Task("report")), calibrated(state.fits)
     assert state.recordings is not None  # noqa: S101
     recordings = state.recordings.filtered
-    return {
-        "page and calibration report of a unit": least(lambda: run_step(Task("report"), state, settings), runs),
-        "attitude": least(lambda: attitude(fits["accelerometer"], fits["gyroscope"], recordings), runs),
+    work = {
+        "page and calibration report of a unit": lambda: run_step(Task("report"), state, settings),
+        "attitude": lambda: attitude(fits["accelerometer"], fits["gyroscope"], recordings),
     }
+    return {name: 1e3 * least(runs, each)[0] for name, each in work.items()}
 
 
 def fleet(units: int) -> list[dict[str, Any]]:
@@ -125,9 +113,8 @@ def main() -> int:
     for name, cost in unit_costs(arguments.runs).items():
         print(f"{name}: {cost:.1f} ms CPU")
     rows = fleet(arguments.units)
-    page = campaign_page.render("fleet", rows, [])
-    cost = least(lambda: campaign_page.render("fleet", rows, []), 3)
-    print(f"page of {arguments.units} units: {cost:.0f} ms CPU, {len(page.encode()) / 1e6:.2f} MB")
+    cost, page = least(3, lambda: campaign_page.render("fleet", rows, []))
+    print(f"page of {arguments.units} units: {1e3 * cost:.0f} ms CPU, {len(page.encode()) / 1e6:.2f} MB")
     costs = browser_costs(page, max(3, arguments.runs // 2))
     print("no Chromium here" if costs is None else ", ".join(f"{k} {v:.0f} ms" for k, v in costs.items()))
     return 0

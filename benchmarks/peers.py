@@ -356,7 +356,6 @@ def xsens(folder: Path, program: Path) -> list[str]:
 
 
 def main() -> None:
-    """Compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, default=60, help="simulated; 0: the public recordings alone")
     parser.add_argument("--imu-tk", type=Path, help="folder of its source; without it, imu_tk is left out")
@@ -388,8 +387,7 @@ def main() -> None:
     print(text)
     if options.out:
         options.out.write_text(text + "\n")
-    if options.figures:
-        write_figures(options.figures, figures)
+    write_figures(options.figures, figures)
 
 
 if __name__ == "__main__":

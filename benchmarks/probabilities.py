@@ -33,7 +33,7 @@ from imu_research.study.bench import at_detection
 from imu_research.study.cases import StudyCase, draw
 from imu_research.study.result import ScoredCase
 from imu_research.study.run import diagnose_case, scored
-from imu_research.study.scores import PROBABILITIES, reliability, stated_and_true
+from imu_research.study.scores import stated_and_true, stated_shares
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS
 from pipeline.estimation.candidates import limits_of
@@ -104,7 +104,6 @@ def diagnosed(sizes: str, seed: int, number: int) -> ScoredCase | None:
 
 
 def main() -> None:
-    """Run it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sizes", choices=DRAWN)
     parser.add_argument("--n", type=int, default=700)
@@ -121,17 +120,13 @@ def main() -> None:
     sets = [true for each in stated_and_true(cases, "answer sets") for true in each]
     mean = 100.0 * float(np.mean([probability for probability, _ in sets]))
     # Clustered by unit: a unit has one set.
-    of_sets = clustered_share(f"all answer sets, stated {mean:.4g} %", [np.array([true]) for _, true in sets])
-    bins = [
-        row._replace(name=f"{of}, stated {row.name}", goal=row.goal if options.sizes != "near" else "")
-        for of in PROBABILITIES
-        for row in reliability(cases, of)
-    ]
-    goal = f"contains {mean:.4g} %" if options.sizes != "near" else ""
-    figures = [*(row._replace(goal=goal) for row in of_sets), *bins]
+    name, goal = f"all answer sets, stated {mean:.4g} %", f"contains {mean:.4g} %"
+    of_sets = clustered_share(name, [np.array([true]) for _, true in sets], goal)
+    figures = [*of_sets, *stated_shares(cases)]
+    if options.sizes == "near":
+        figures = [figure._replace(goal="") for figure in figures]
     sys.stdout.write("\n".join(" | ".join(map(str, figure.cells)) for figure in figures) + "\n")
-    if options.figures:
-        write_figures(options.figures, figures)
+    write_figures(options.figures, figures)
 
 
 if __name__ == "__main__":

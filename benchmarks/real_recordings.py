@@ -143,7 +143,6 @@ def figures_of_set(campaign: Path, unit: str, authors: dict[str, Entry] | None) 
 
 
 def figures_of(result: UnitResult, unit: str) -> list[MeasuredFigure]:
-    """Return the figures of a calibrated unit."""
     validation: dict[str, Any] = result.validation
     found = []
     for sensor, (scale, measured_in) in SENSORS.items():
@@ -167,7 +166,6 @@ def figures_of(result: UnitResult, unit: str) -> list[MeasuredFigure]:
 
 
 def main() -> None:
-    """Calibrate and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--xsens", type=Path, help="folder of the recording")
     parser.add_argument("--sets", type=Path, help="folder of clones, see benchmarks/sets/sources.yaml")
@@ -192,8 +190,7 @@ def main() -> None:
                 found += figures_of_set(folder, unit, source.get("authors"))
     for figure in found:
         print(*figure.cells)
-    if options.figures:
-        write_figures(options.figures, found)
+    write_figures(options.figures, found)
 
 
 if __name__ == "__main__":

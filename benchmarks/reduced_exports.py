@@ -65,7 +65,6 @@ def _best(
 
 
 def _rms(M: np.ndarray, b: np.ndarray, readings: np.ndarray, truth: np.ndarray) -> float:
-    """Return the rms of the calibrated reading's error."""
     return float(np.sqrt(np.mean(np.sum(((readings - b) @ M.T - truth) ** 2, axis=1))))
 
 
@@ -111,7 +110,6 @@ def may_be_left_out(name: str) -> bool:
 
 
 def main() -> None:
-    """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, default=2, help="of each effect")
     parser.add_argument("--seed", type=int, default=7)
@@ -140,8 +138,7 @@ def main() -> None:
     )
     far = shown[(over_best > MOST_WORSE) | (over_fit > MOST_WORSE)]
     print(far.sort_values("over_best").to_string(index=False))
-    if options.figures:
-        write_figures(options.figures, figures)
+    write_figures(options.figures, figures)
 
 
 if __name__ == "__main__":

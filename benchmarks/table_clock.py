@@ -12,11 +12,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import beta
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "io"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from simulated_logs import as_table, beside_a_table, clock_errors
 
+from imu_research.figures import clopper_pearson
 from pipeline.ingest.clock_alignment import align
 
 
@@ -44,7 +44,7 @@ def main() -> None:
     every = np.concatenate([np.array(e) for e in found.values()])
     for name, error, stated in (("offset", every[:, 0], every[:, 1]), ("drift", every[:, 2], every[:, 3])):
         n, k = len(error), int(np.sum(np.abs(error) < 2.0 * stated))
-        low, high = beta.ppf(0.025, k, n - k + 1), beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
+        low, high = clopper_pearson(k, n)
         print(f"{name}: {k} of {n} within two standard uncertainties: {k / n:.3f} ({low:.3f} to {high:.3f})")
     print(f"{spent / len(every):.3f} CPU s a recording")
 

@@ -20,9 +20,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from measuring import least
 
 from imu_research.figures import MeasuredFigure, write_figures
 
@@ -72,8 +75,7 @@ def main() -> None:
             found = json.loads(Path(folder, "unit", "cost.json").read_text(encoding="utf-8"))
         figures.append(MeasuredFigure(f"{title}: CPU", found["cpu_s"], 1, f"<= {wanted:g}", unit="s"))
         figures.append(MeasuredFigure(f"{title}: largest memory", found["memory_mb"], 1, f"<= {MOST_MB:g}", unit="MB"))
-    if options.figures:
-        write_figures(options.figures, figures)
+    write_figures(options.figures, figures)
 
 
 def _short() -> list[MeasuredFigure]:
@@ -88,13 +90,9 @@ def _short() -> list[MeasuredFigure]:
             "demo": (ROOT / "data" / "demo", "mpu6050-1"),
             "by hand": (Path(folder, "hand"), "U001"),
         }.items():
-            spent = []
-            for _ in range(1 + TIMES):
-                before = time.process_time()
-                pipeline.calibrate_unit(campaign, unit)
-                spent.append(time.process_time() - before)
-            print(f"{name}, warm: {min(spent[1:]):.3f} CPU s")
-            figures.append(MeasuredFigure(f"{name}, warm: CPU", min(spent[1:]), TIMES, f"<= {SHORT[name]:g}", unit="s"))
+            spent, _ = least(1 + TIMES, partial(pipeline.calibrate_unit, campaign, unit))
+            print(f"{name}, warm: {spent:.3f} CPU s")
+            figures.append(MeasuredFigure(f"{name}, warm: CPU", spent, TIMES, f"<= {SHORT[name]:g}", unit="s"))
     return figures
 
 
@@ -104,7 +102,7 @@ def _commands() -> list[MeasuredFigure]:
     with tempfile.TemporaryDirectory() as folder:
         shutil.copytree(ROOT / "data" / "demo", Path(folder, "bench"))
 
-        def least(words: list[str], times: int = TIMES) -> float:
+        def least_of_command(words: list[str], times: int = TIMES) -> float:
             spent = []
             for _ in range(times):
                 before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -114,10 +112,10 @@ def _commands() -> list[MeasuredFigure]:
             return min(spent)
 
         run = ["-m", "snakemake", "--cores", "2", "--snakefile", str(ROOT / "Snakefile"), "--config", "campaign=bench"]
-        least(run, 1)
-        imports = least(["-c", IMPORTS])
+        least_of_command(run, 1)
+        imports = least_of_command(["-c", IMPORTS])
         for name, (words, wanted) in COMMANDS.items():
-            ratio = least(["-m", "pipeline", *words], 1 if name == "add" else TIMES) / imports
+            ratio = least_of_command(["-m", "pipeline", *words], 1 if name == "add" else TIMES) / imports
             title = f"{name}: CPU over importing libraries"
             print(f"{title}: {ratio:.2f}", flush=True)
             figures.append(MeasuredFigure(title, ratio, 1, f"<= {wanted:g}", unit="times"))

@@ -136,7 +136,7 @@ def read_frame(frame: pd.DataFrame, name: str = "(DataFrame)", profile: Profile 
     return read_canonical(name, canonical_csv(name, frame), profile)
 
 
-def read_canonical(name: str, text: bytes, profile: Profile | None = None) -> Log:
+def read_canonical(name: str, text: bytes, profile: Profile | None) -> Log:
     """Read a canonical CSV that is in memory; ``name`` stands for it in messages; ``profile``: of its ``checks``."""
     from imu_logs.profile import checks_of, csv_formats, load_profile  # noqa: PLC0415  (as in ``read``)
     from imu_logs.text_read import read_stream  # noqa: PLC0415  (likewise)

@@ -225,6 +225,14 @@ def unchanged(path: Path) -> Iterator[None]:
         raise IngestError(message, str(path), code="changed", hint=hint)
 
 
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a new file beside ``path``, which takes its place when it is complete."""
+    new = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    yield new
+    new.replace(path)
+
+
 def refuse_foreign(start: bytes, path: str) -> None:
     """Raise ``IngestError`` for a file that begins like another kind of file."""
     what = kind_of(start)

@@ -1,4 +1,13 @@
-"""Parse records of an MCAP file with the official library; unpack chunks and split them into messages.
+"""Read MCAP files in one pass from the first byte to the last, and check that they are complete.
+
+    file   = magic | data section | summary | magic
+    record = opcode (1 byte) | length (8 bytes) | content (length bytes)
+
+The official library parses a record. It returns short data if a length is too large, ignores contradicting lengths,
+does not check the checksum of attachments, and reads an index entry by entry; here such records are refused, and an
+index is read as an array. Also checked are the checksums of each chunk, the data section and the summary (0: the
+recorder computed none), and the counts in the summary. Every length is first compared with the number of remaining
+bytes.
 
 A run of records (a chunk, or the messages between chunks) is split by following the lengths from record to record:
 
@@ -6,20 +15,8 @@ A run of records (a chunk, or the messages between chunks) is split by following
 
 If all records have one length, the starts are an arithmetic series. If the file has an index, they are its offsets.
 Else the lengths are followed one by one. numpy checks the first two with the rule above, so that a wrong index has no
-effect.
-
-The library returns short data if a length is too large, ignores contradicting lengths, does not check the checksum of
-attachments, and reads an index entry by entry. Here such records are refused, and an index is read as an array.
-
-Read MCAP files in one pass from the first byte to the last, and check that they are complete.
-
-    file   = magic | data section | summary | magic
-    record = opcode (1 byte) | length (8 bytes) | content (length bytes)
-
-Checked are the checksums of each chunk, each attachment, the data section and the summary (0: the recorder computed
-none); that records fill their chunks; and that the counts in the summary are right. Every length is first compared with
-the number of remaining bytes. Messages are returned chunk by chunk, so that the largest chunk determines the memory. A
-file is known to be complete only after the iteration has ended without an error.
+effect. Messages are returned run by run, so that the largest chunk determines the memory. A file is known to be
+complete only after the iteration has ended without an error.
 """
 
 from __future__ import annotations
@@ -68,7 +65,6 @@ ONLY_IN_SUMMARY = frozenset(Opcode) - ONLY_IN_DATA - frozenset(DEFINITIONS)
 _KINDS = frozenset(Opcode)
 COPY_AGAIN = "copy the file again from its source"
 RUN_SIZE = 1 << 20  # bytes of messages outside chunks that are returned together, as the recorders' usual chunk
-_RECORD = struct.Struct("<BQ")
 
 
 @dataclass
@@ -99,7 +95,7 @@ class ChannelMessages:
         """Return all messages as an array of a structured type; they must have the size of that type."""
         if self.stride:
             return np.ndarray(len(self.starts), layout, self.data.data, int(self.starts[0]), (self.stride,))
-        return np.asarray(sliding_window_view(self.data, layout.itemsize)[self.starts].view(layout)[:, 0])
+        return _records(self.data, self.starts, layout)
 
 
 @dataclass
@@ -165,7 +161,7 @@ def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[ChannelMessages]
     if starts is None:
         starts, more = _followed(run.data, first)
         others += more
-    heads = _heads(data, starts)
+    heads = _records(data, starts, HEAD)
     rows = []
     for channel in np.unique(heads["channel"]).tolist():
         mask = heads["channel"] == channel
@@ -221,14 +217,14 @@ def _indexed(run: Run, data: NDArray[np.uint8], first: int) -> Integers | None:
     starts = np.sort(np.concatenate(list(run.index.values())))
     if not (len(starts) and starts[0] == first and starts[-1] + HEAD.itemsize <= len(data)):
         return None
-    heads = _heads(data, starts)
+    heads = _records(data, starts, HEAD)
     fitting = (heads["opcode"] == Opcode.MESSAGE) & (heads["length"] >= MESSAGE_HEAD) & (heads["length"] <= len(data))
     ends = starts + RECORD_HEAD + heads["length"].astype(np.int64)
     return starts if fitting.all() and np.array_equal(ends, np.append(starts[1:], len(data))) else None
 
 
-def _heads(data: NDArray[np.uint8], starts: Integers) -> NDArray[np.void]:
-    return np.asarray(sliding_window_view(data, HEAD.itemsize)[starts].view(HEAD)[:, 0])
+def _records(data: NDArray[np.uint8], starts: Integers, layout: np.dtype[np.void]) -> NDArray[np.void]:
+    return np.asarray(sliding_window_view(data, layout.itemsize)[starts].view(layout)[:, 0])
 
 
 class _Content(ReadDataStream):

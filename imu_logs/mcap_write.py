@@ -14,7 +14,6 @@ summary is computed again, because the records have new offsets.
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
 from collections import Counter
@@ -30,6 +29,7 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from imu_logs.errors import InputError
+from imu_logs.files import replacing
 from imu_logs.log import Index, Integers, Log, Values
 from imu_logs.mcap_file import (
     HEAD,
@@ -101,8 +101,7 @@ def write_mcap(path: Path, log: Log) -> None:
     if len(time) and not (time.min() >= 0 and time.max() < 2**31 * SECOND_NS):
         raise InputError("times of a ROS 2 stamp lie between 0 and 2^31 s", str(path))
     streams = _streams(log)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as stream:
+    with replacing(path) as new, new.open("wb") as stream:
         writer = Writer(stream, enable_data_crcs=True)
         writer.start(profile="ros2", library="imu-calibration")
         channels = []
@@ -113,7 +112,6 @@ def write_mcap(path: Path, log: Log) -> None:
             for channel, messages in zip(channels, streams.values(), strict=True):
                 writer.add_message(channel, stamp, messages[row].tobytes(), stamp, row)
         writer.finish()  # type: ignore[no-untyped-call]
-    temporary.replace(path)
 
 
 def _streams(log: Log) -> dict[str, NDArray[np.uint8]]:

@@ -393,12 +393,11 @@ def mcap_formats(profile: Profile) -> list[McapFormat]:
     if profile.mcap.get("topics") or profile.csv.get("parts"):
         message = "ingest.mcap.parts: topics stand in each part, and ingest.csv.parts is null beside them"
         raise ConfigurationError(message)
-    places = {f"ingest.mcap.parts[{index}]": part for index, part in enumerate(parts)}
-    checked = [(where, validated(_LogPart, part, where)) for where, part in places.items()]
-    of_parts = [
-        (where, profile.model_copy(update={"mcap": {**profile.mcap, "topics": part.topics}})) for where, part in checked
-    ]
-    formats = [mcap_format(of_part, where) for where, of_part in of_parts]
+    formats = []
+    for index, entry in enumerate(parts):
+        where = f"ingest.mcap.parts[{index}]"
+        topics = validated(_LogPart, entry, where).topics
+        formats.append(mcap_format(profile.model_copy(update={"mcap": {**profile.mcap, "topics": topics}}), where))
     _once("ingest.mcap.parts", ([c for topic in f.topics.values() for c in topic] for f in formats), "parts")
     return formats
 

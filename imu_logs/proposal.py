@@ -161,24 +161,20 @@ def layouts_of(path: Path) -> list[UnknownLog]:
     Raises ``IngestError`` for a file without a table of numbers.
     """
     with unchanged(path):
-        return _layouts_of(path)
+        if is_message_log(path):
+            from imu_logs.message_read import topics_of  # noqa: PLC0415  (only where it is needed)
 
-
-def _layouts_of(path: Path) -> list[UnknownLog]:
-    if is_message_log(path):
-        from imu_logs.message_read import topics_of  # noqa: PLC0415  (only where it is needed)
-
-        return topics_of(path)[:1]  # the one with most sensors
-    if path.suffix.lower() == ZIP:
-        tables = [layout for file in text_members(path) for layout in _table_in(path, file)]
-        found = [layout for layout in tables if find_columns(layout).triads]
-        if not found:
-            raise IngestError("no text log in it holds the three axes of a sensor", str(path), code="no_table")
-        return found
-    with path.open("rb") as stream:
-        data = stream.read(SEARCHED_BYTES)
-    refuse_foreign(data[:18], str(path))
-    return [find_layout(data, str(path))]
+            return topics_of(path)[:1]  # the one with most sensors
+        if path.suffix.lower() == ZIP:
+            tables = [layout for file in text_members(path) for layout in _table_in(path, file)]
+            found = [layout for layout in tables if find_columns(layout).triads]
+            if not found:
+                raise IngestError("no text log in it holds the three axes of a sensor", str(path), code="no_table")
+            return found
+        with path.open("rb") as stream:
+            data = stream.read(SEARCHED_BYTES)
+        refuse_foreign(data[:18], str(path))
+        return [find_layout(data, str(path))]
 
 
 def _table_in(archive: Path, file: Path) -> list[UnknownLog]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from pyarrow import csv as arrow_csv
 
 from imu_logs.errors import ConfigurationError, IngestError
+from imu_logs.files import replacing
 from imu_logs.log import Integers, Log, Values
 from imu_logs.units import CANONICAL
 
@@ -125,17 +125,14 @@ def write_canonical_csv(path: Path, log: Log, decimals: Mapping[str, int] = Mapp
             arrays[name] = _decimal(values, decimals[name])
         elif channel in columns:
             arrays[name] = to_arrow(np.ascontiguousarray(columns[channel]))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as stream:
+    with replacing(path) as new, new.open("wb") as stream:
         stream.write((",".join(arrays) + "\n").encode())
         arrow_csv.write_csv(pa.table(arrays), stream, arrow_csv.WriteOptions(include_header=False))
-    temporary.replace(path)
 
 
 def write_parquet(path: Path, log: Log) -> None:
     """Write ``log.to_arrow()`` as a Parquet file; the file is replaced atomically."""
     from pyarrow import parquet  # noqa: PLC0415  (only where it is needed)
 
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    parquet.write_table(log.to_arrow(), temporary)
-    temporary.replace(path)
+    with replacing(path) as new:
+        parquet.write_table(log.to_arrow(), new)

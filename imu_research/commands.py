@@ -56,13 +56,7 @@ def study(argv: Sequence[str]) -> int:
     countdown.end()
     cases = cases_of(*(run.read_lines(arguments.directory / name) for name in (run.TRUTH_FILE, run.RESULTS_FILE)))
     found = [*scores.accepted(cases), *scores.family_scores(cases), *scores.answer_scores(cases)]
-    if arguments.figures:
-        stated = [
-            f._replace(name=f"{of}, stated {f.name}")
-            for of in scores.PROBABILITIES
-            for f in scores.reliability(cases, of)
-        ]
-        write_figures(arguments.figures, [*found, *scores.false_selection_rates(cases), *stated])
+    write_figures(arguments.figures, [*found, *scores.false_selection_rates(cases), *scores.stated_shares(cases)])
     for score in found:
         name, n, value, interval, goal = score.cells
         print(f"{name:<92} {n:>5} {value:>8} {interval:<16} {goal:<9} {' '.join(score.misses[:8])}".rstrip())
@@ -90,13 +84,8 @@ def thesis(argv: Sequence[str]) -> int:
     """Compare the results with the figures of the thesis, and test its conclusions over many seeds."""
     parser = parser_of("thesis", thesis.__doc__, THESIS)
     parser.add_argument("what", choices=("page", "seeds"))
-    parser.add_argument(
-        "--campaign",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="campaign with simulation.yaml and the folder printed/",
-    )
+    words = "campaign with simulation.yaml and the folder printed/"
+    parser.add_argument("--campaign", type=Path, required=True, metavar="DIR", help=words)
     parser.add_argument("--results", type=Path, metavar="DIR", help="page: results of the campaign")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="file to write")
     parser.add_argument("--seeds", type=int, default=50, help="seeds: how many (default: 50)")

@@ -80,6 +80,12 @@ def wilson(hits: int, total: int, level: float = 0.95) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
+def clopper_pearson(hits: int, total: int) -> tuple[float, float]:
+    """Return the exact 95 % interval of a share (Clopper and Pearson, Biometrika 26, 1934)."""
+    found = scipy.stats.binomtest(hits, total).proportion_ci(0.95, method="exact")
+    return float(found.low), float(found.high)
+
+
 def share(name: str, right: pd.Series[bool], goal: str = "") -> list[MeasuredFigure]:
     """Return the share of the true values, with the labels of the others as misses; an empty list for no values."""
     hits, total = int(right.sum()), len(right)
@@ -108,6 +114,7 @@ def clustered_share(name: str, inside: Sequence[Values], goal: str = "", level: 
     return [MeasuredFigure(name, s, int(sizes.sum()), goal, (max(0.0, s - half), min(1.0, s + half)))]
 
 
-def write_figures(path: Path, figures: Iterable[MeasuredFigure]) -> None:
-    """Write the figures of a command as JSON."""
-    path.write_text(json.dumps([figure.to_json() for figure in figures], indent=1) + "\n", encoding="utf-8")
+def write_figures(path: Path | None, figures: Iterable[MeasuredFigure]) -> None:
+    """Write the figures of a command as JSON; without a path, do nothing."""
+    if path:
+        path.write_text(json.dumps([figure.to_json() for figure in figures], indent=1) + "\n", encoding="utf-8")

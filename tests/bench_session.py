@@ -80,29 +80,23 @@ SIZE = {
 }
 
 
-def values_of(sensor: str, name: str, rng: np.random.Generator, factor: float = 1.0) -> np.ndarray:
+def values_of(sensor: str, name: str, rng: np.random.Generator) -> np.ndarray:
     """Return an effect's parameters at data-sheet size, with random signs where the size is one number."""
     size = SIZE[sensor][name]
     if isinstance(size, list):
-        return np.array(size) * (np.append(np.full(len(size) - 1, factor), 1.0) if name == "warm_up" else factor)
-    return factor * size * rng.choice([-1.0, 1.0], len(effect(name).parameters(sensor)))
+        return np.array(size)
+    return size * rng.choice([-1.0, 1.0], len(effect(name).parameters(sensor)))
 
 
 @dataclass(frozen=True)
 class Session:
-    """What to simulate.
-
-    Attributes
-    ----------
-    effects : sensor to effect to values.
-    """
+    """What to simulate."""
 
     seed: int = 0
     course: Course = STOP_AND_GO
-    effects: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    effects: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)  # sensor to effect to values
     white: float = 1.0
     wander: float = 1.0
-    wander_time: float = WANDER_S
     interval: float = 0.12
     temperature: bool = True
     clock_shared: bool = True
@@ -113,16 +107,8 @@ class Session:
 def record(session: Session) -> list[Recording]:
     """Return the recordings of both sensors."""
     rng = np.random.default_rng(session.seed)
-    air = Environment(
-        25.0 + rng.uniform(-1, 1),
-        4.5,
-        300.0,
-        0.3,
-        np.array([2100.0, 4700.0]),
-        rng.uniform(0, 6, 2),
-        session.ramp,
-        2000.0,
-    )
+    mean, phase = 25.0 + rng.uniform(-1, 1), rng.uniform(0, 6, 2)
+    air = Environment(mean, 4.5, 300.0, 0.3, np.array([2100.0, 4700.0]), phase, session.ramp, 2000.0)
     course = replace(session.course, static_s=session.course.static_s if session.static else 0.0)
     planned, start, plans = plan("three_axis_turns", course, rng), 30.0, []
     for item in planned:
@@ -177,10 +163,7 @@ def _recording(  # noqa: PLR0917  (one of everything that a recording is made of
 def _noise(sensor: str, times: list[np.ndarray], session: Session, rng: np.random.Generator) -> list[np.ndarray]:
     time = np.concatenate(times)
     grid = np.arange(time[0], time[-1] + session.interval, session.interval)
-    r = np.exp(-session.interval / session.wander_time)
-    drive = rng.standard_normal((len(grid), 3)) * np.sqrt(1 - r * r)
-    drive[0] = rng.standard_normal(3)
-    wander = lfilter([1.0], [1.0, -r], drive, axis=0)
+    wander = gauss_markov(rng, len(grid), session.interval / WANDER_S)
     at = [np.clip(np.searchsorted(grid, t), 0, len(grid) - 1) for t in times]
     return [
         session.white * WHITE[sensor] * rng.standard_normal((len(t), 3)) + session.wander * WANDER[sensor] * wander[i]
@@ -191,14 +174,14 @@ def _noise(sensor: str, times: list[np.ndarray], session: Session, rng: np.rando
 def gauss_markov(rng: np.random.Generator, n: int, step: float) -> np.ndarray:
     """Return n values of standard deviation 1 on three axes, ``step`` correlation times apart: (n, 3) array."""
     keep = np.exp(-step)
-    drive = rng.normal(size=(n, 3))
-    drive[1:] *= np.sqrt(1 - keep**2)
+    drive = rng.standard_normal((n, 3)) * np.sqrt(1 - keep**2)
+    drive[0] = rng.standard_normal(3)
     return np.asarray(lfilter([1.0], [1.0, -keep], drive, axis=0))
 
 
-def random_motion(seed: int, n: int = 5) -> Motion:
-    """Return samples at which every signal has a random value."""
-    rng = np.random.default_rng(seed)
+def random_motion(seed: int) -> Motion:
+    """Return five samples at which every signal has a random value."""
+    rng, n = np.random.default_rng(seed), 5
     level = np.linalg.qr(rng.standard_normal((n, 3, 3)))[0]
     return Motion(
         time=np.sort(rng.uniform(0, 3600, n)),

@@ -10,15 +10,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.signal import lfilter
+from bench_session import gauss_markov
+from hand_session import fitted
 from scipy.spatial.transform import Rotation
 from unit_settings import settings_of, with_noise
 
 from pipeline.core.records import Recording
-from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.chips import Chip
-from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.estimation.stages import StageInput, fit_stage
+from pipeline.estimation.stages import fit_stage
 from pipeline.simulation.description import shipped_settings
 
 if TYPE_CHECKING:
@@ -30,7 +29,6 @@ H = 2e-4  # s, of the differences
 SLOW = 8.0  # deg/s: at a place 5 cm off the axis that adds 0.1 mg
 WHITE = {"accelerometer": 2.8e-3, "gyroscope": 0.035}
 WANDER = {"accelerometer": 1e-4, "gyroscope": 3e-3}
-HAND = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
 
 
 @dataclass(frozen=True)
@@ -43,9 +41,10 @@ class Path:
     info: dict[str, Any] = field(default_factory=dict)
 
 
-def by_hand(rng: np.random.Generator, rests: int = 24, rate: float = 100.0, *, turn: tuple[float, float] = (50, 140),
-            axis: Array | None = None) -> Path:  # fmt: skip
-    """Rests of 3 s and moves of 1 s, each about an axis at random (or one axis) while the hand shakes."""
+def by_hand(
+    rng: np.random.Generator, rests: int = 24, *, turn: tuple[float, float] = (50, 140), axis: Array | None = None
+) -> Path:
+    """Rests of 3 s and moves of 1 s, each about an axis at random (or one axis) while the hand shakes; 100 Hz."""
     starts, base, turns = [], [Rotation.from_rotvec(rng.uniform(-1, 1, 3))], []
     t = 3.0
     for _ in range(rests - 1):
@@ -55,7 +54,7 @@ def by_hand(rng: np.random.Generator, rests: int = 24, rate: float = 100.0, *, t
         turns.append(vector)
         base.append(base[-1] * Rotation.from_rotvec(vector))
         t += 1.0 + rng.uniform(2.5, 3.5)
-    time = np.arange(0.01, t, 1.0 / rate)
+    time = np.arange(0.01, t, 0.01)
     begin, moves, shake = np.array(starts), np.array(turns), rng.uniform(1, 3, (rests, 3))
     quats = np.array([b.as_quat() for b in base])
 
@@ -104,27 +103,22 @@ def draw_chip(rng: np.random.Generator, axes: Array, place: Array, delay: float 
     return TrueChip(axes, place, bias, K, delay)
 
 
-def read(
-    chip: TrueChip, truth: dict[str, Array], rng: np.random.Generator, interval: float, noise: float = 1.0
-) -> dict[str, Array]:
+def read(chip: TrueChip, truth: dict[str, Array], rng: np.random.Generator, interval: float) -> dict[str, Array]:
     found = {}
     for sensor, values in truth.items():
-        keep = np.exp(-interval / 100.0)
-        drive = WANDER[sensor] * rng.standard_normal(values.shape)
-        drive[1:] *= np.sqrt(1 - keep**2)
-        slow = lfilter([1.0], [1.0, -keep], drive, axis=0)
+        slow = WANDER[sensor] * gauss_markov(rng, len(values), interval / 100.0)
         clean = chip.bias[sensor] + values @ (chip.K[sensor] @ chip.axes).T
-        found[sensor] = clean + noise * (slow + WHITE[sensor] * rng.standard_normal(values.shape))
+        found[sensor] = clean + slow + WHITE[sensor] * rng.standard_normal(values.shape)
     return found
 
 
-def hand_board(rng: np.random.Generator, chips: Sequence[TrueChip], path: Path, noise: float = 1.0) -> list[Chip]:
+def hand_board(rng: np.random.Generator, chips: Sequence[TrueChip], path: Path) -> list[Chip]:
     """Return the chips of a board that was moved by hand, calibrated each by itself."""
     settings, found = settings_of(sensor="mpu6050", table="hand", procedure={"holdout_every": 3}), []
     for number, chip in enumerate(chips):
-        readings = read(chip, felt(path, chip.place, shift=chip.delay), rng, float(np.diff(path.time).mean()), noise)
+        readings = read(chip, felt(path, chip.place, shift=chip.delay), rng, float(np.diff(path.time).mean()))
         recordings = [Recording("recording", "rests", None, np.round(path.time * 1e9).astype(np.int64), **readings)]
-        fits = {s: fit.fit(StageInput(s, with_noise(recordings, settings), None, settings)) for s, fit in HAND.items()}
+        fits = {s: fitted(s, recordings, settings) for s in WHITE}
         found.append(Chip(f"chip{number}", recordings, fits, settings.sensor))
     return found
 
@@ -132,7 +126,7 @@ def hand_board(rng: np.random.Generator, chips: Sequence[TrueChip], path: Path, 
 UP = {"x": [0, 0, 1], "y": [0, 0, 1], "z": [1, 0, 0]}
 
 
-def table_path(axis: str, rates: Sequence[float], rate: float = 50.0, turn_s: float = 4.0) -> Path:
+def table_path(axis: str, rates: Sequence[float], rate: float, turn_s: float = 4.0) -> Path:
     """Return a turn about one axis: rest, ramp, turn, ramp, rest for each rate."""
     knots = [(0.0, 0.0)]
     for w in rates:
@@ -140,20 +134,20 @@ def table_path(axis: str, rates: Sequence[float], rate: float = 50.0, turn_s: fl
             knots.append((knots[-1][0] + length, end))
     at, w = np.array(knots).T
 
+    lengths, changes = np.diff(at), np.diff(w)
+    angles = np.append(0.0, np.cumsum(lengths * (w[:-1] + 0.5 * changes)))
+
+    def place(x: Array) -> tuple[Array, Array]:
+        k = np.clip(np.searchsorted(at, x, side="right") - 1, 0, len(at) - 2)
+        return k, np.clip((x - at[k]) / lengths[k], 0.0, 1.0)
+
     def smooth_rate(x: Array) -> Array:
-        k = np.clip(np.searchsorted(at, x, side="right") - 1, 0, len(at) - 2)
-        s = np.clip((x - at[k]) / (at[k + 1] - at[k]), 0.0, 1.0)
-        return w[k] + (w[k + 1] - w[k]) * s * s * (3.0 - 2.0 * s)
+        k, s = place(x)
+        return w[k] + changes[k] * s * s * (3.0 - 2.0 * s)
 
-    k_angle = np.zeros(len(at))
-    for k in range(len(at) - 1):  # the integral of 3 s^2 - 2 s^3 is s^3 - s^4 / 2
-        k_angle[k + 1] = k_angle[k] + (at[k + 1] - at[k]) * (w[k] + (w[k + 1] - w[k]) * 0.5)
-
-    def angle_at(x: Array) -> Array:
-        k = np.clip(np.searchsorted(at, x, side="right") - 1, 0, len(at) - 2)
-        length = at[k + 1] - at[k]
-        s = np.clip((x - at[k]) / length, 0.0, 1.0)
-        return k_angle[k] + length * (w[k] * s + (w[k + 1] - w[k]) * (s**3 - 0.5 * s**4))
+    def angle_at(x: Array) -> Array:  # the integral of 3 s^2 - 2 s^3 is s^3 - s^4 / 2
+        k, s = place(x)
+        return angles[k] + lengths[k] * (w[k] * s + changes[k] * (s**3 - 0.5 * s**4))
 
     j = "xyz".index(axis)
     up = np.array(UP[axis], float)
@@ -167,8 +161,10 @@ def table_path(axis: str, rates: Sequence[float], rate: float = 50.0, turn_s: fl
     return Path(time, attitude, lambda x: np.zeros((len(x), 3)), {"angle": angle_at(time), "rate": smooth_rate(time)})
 
 
-def table_board(rng: np.random.Generator, chips: Sequence[TrueChip], plans: dict[str, Sequence[float]],
-                noise: float = 1.0, rate: float = 50.0, **table: float) -> list[Chip]:  # fmt: skip
+def table_board(
+    rng: np.random.Generator, chips: Sequence[TrueChip], plans: dict[str, Sequence[float]], rate: float = 50.0,
+    **table: float,
+) -> list[Chip]:  # fmt: skip
     """Return the chips of a board that was turned on a table, calibrated each by itself against the table's log.
 
     ``plans``: turn axis to the rates of the gyroscope's recordings; the accelerometer's turn slowly.
@@ -180,7 +176,7 @@ def table_board(rng: np.random.Generator, chips: Sequence[TrueChip], plans: dict
     for number, chip in enumerate(chips):
         recordings, start = [], 1.0
         for role, axis, path in paths:
-            readings = read(chip, felt(path, chip.place), rng, 1.0 / rate, noise)
+            readings = read(chip, felt(path, chip.place), rng, 1.0 / rate)
             stamps = np.round((path.time + start) * 1e9).astype(np.int64)
             start += float(path.time[-1]) + 10.0
             name = ("accel_" if role == "accelerometer" else "gyro_") + axis

@@ -76,7 +76,6 @@ def designs() -> Iterator[Counter[tuple[Any, ...]]]:
 
 
 def names(calls: Calls) -> set[str]:
-    """Return the names of the called functions."""
     return {name for name, _ in calls}
 
 

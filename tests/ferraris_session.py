@@ -2,43 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from unit_settings import settings_of, with_noise
+from hand_session import Unit
+from unit_settings import settings_of
 
-from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.estimation.stages import StageInput
 from pipeline.physics.signal.rests import find_rests
 from pipeline.physics.signal.segments import cut, held_out_windows
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, shipped_settings
 
-if TYPE_CHECKING:
-    from pipeline.core.records import Recording, SensorCalibration
-    from pipeline.core.settings import Settings
-
 PROCEDURE = shipped_settings(procedure="ferraris").procedure
-FITS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
 
 
-@dataclass(frozen=True)
-class Session:
-    """Recordings of a unit, its truth, and the settings of a run."""
-
-    recordings: list[Recording]
-    truth: dict[str, Any]
-    settings: Settings
-
-    def fit(self, sensor: str) -> SensorCalibration:
-        return FITS[sensor].fit(StageInput(sensor, with_noise(self.recordings, self.settings), None, self.settings))
+class Session(Unit):
+    """A unit whose truth is in the frame of its calibration."""
 
     def errors(self, sensor: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the error of bias and matrix, its standard uncertainty and degrees of freedom: (12,) arrays."""
-        found = self.fit(sensor)
+        found = self.calibrated(sensor)
         assert found.covariance is not None
         assert found.freedom is not None
         truth = np.append(self.truth[sensor]["bias"], self.truth[sensor]["matrix"])
@@ -46,12 +31,11 @@ class Session:
         return error, np.sqrt(np.diag(found.covariance))[:12], found.freedom[:12]
 
 
-def simulated(seed: int, *, model: str = "mpu6050", procedure: Any = None, **unit: Any) -> Session:
+def simulated(seed: int, *, procedure: Any = None, **unit: Any) -> Session:
     """Return a simulated unit; ``procedure`` replaces settings of the procedure, ``unit`` those of its description."""
-    described = UnitDescription("U", sensor=model, table="hand", procedure="ferraris", **{"interval_s": 0.02, **unit})
-    recordings, truth = simulate_unit(described, seed, 0)
-    settings = settings_of(settings_of(sensor=model, table="hand", procedure="ferraris"), procedure=procedure or {})
-    return Session(recordings, truth, settings)
+    groups = {"sensor": "mpu6050", "table": "hand", "procedure": "ferraris"}
+    recordings, truth = simulate_unit(UnitDescription("U", **groups, **{"interval_s": 0.02, **unit}), seed, 0)
+    return Session(recordings, truth, settings_of(settings_of(**groups), procedure=procedure or {}))
 
 
 def held_out(session: Session) -> Session:

@@ -13,11 +13,14 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import StageInput
+from pipeline.output.exports.sensors import rotation_times_lower
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 from tests.published import diagnose
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pipeline.core.records import Recording, SensorCalibration
     from pipeline.core.settings import Settings
 
@@ -25,24 +28,21 @@ METHODS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_move
 WARM = {"warm_up": 25.0}  # degC in a session of some minutes: a unit that is heated
 
 
+def fitted(sensor: str, recordings: Sequence[Recording], settings: Settings) -> SensorCalibration:
+    """Return the fit of a sensor to recordings by hand."""
+    return METHODS[sensor].fit(StageInput(sensor, with_noise(recordings, settings), None, settings))
+
+
 @dataclass(frozen=True)
 class Unit:
-    """A simulated unit.
-
-    Attributes
-    ----------
-    recordings : list of Recording
-    truth : dict
-    settings : Settings
-        As a stage reads them.
-    """
+    """A simulated unit: its recordings, its truth, and the settings of a run."""
 
     recordings: list[Recording]
     truth: dict[str, Any]
     settings: Settings
 
     def calibrated(self, sensor: str) -> SensorCalibration:
-        return METHODS[sensor].fit(StageInput(sensor, with_noise(self.recordings, self.settings), None, self.settings))
+        return fitted(sensor, self.recordings, self.settings)
 
     def diagnosed(self, sensor: str, configured: Any = (), calibration: SensorCalibration | None = None) -> Any:
         names = configured if isinstance(configured, str) else list(configured)
@@ -52,23 +52,16 @@ class Unit:
 
     def true_matrix(self, sensor: str) -> np.ndarray:
         """Return the true matrix in the frame of the calibration: that in which the accelerometer's is triangular."""
-        return frame_of(np.array(self.truth["accelerometer"]["matrix"])).T @ np.array(self.truth[sensor]["matrix"])
+        frame, _ = rotation_times_lower(np.array(self.truth["accelerometer"]["matrix"]))
+        return frame.T @ np.array(self.truth[sensor]["matrix"])
 
 
 @cache
 def _simulated(  # noqa: PLR0917  (its arguments are the key)
     model: str, seed: int, procedure: str, effects: tuple, temperature: tuple, other: tuple
 ) -> Any:
-    unit = UnitDescription(
-        "U",
-        sensor=model,
-        table="hand",
-        procedure=procedure,
-        effects=dict(effects),
-        temperature=dict(temperature),
-        **dict(other),
-    )
-    return simulate_unit(unit, seed, 0)
+    more = {"effects": dict(effects), "temperature": dict(temperature), **dict(other)}
+    return simulate_unit(UnitDescription("U", sensor=model, table="hand", procedure=procedure, **more), seed, 0)
 
 
 def hand_held(
@@ -86,10 +79,3 @@ def hand_held(
     recordings, truth = _simulated(model, seed, procedure, *parts)
     settings = settings_of(sensor=model, table="hand", procedure={"holdout_every": holdout_every})
     return Unit(recordings, truth, settings)
-
-
-def frame_of(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation Q of ``matrix = Q L`` with L lower triangular and positive on its diagonal."""
-    flipped, _ = np.linalg.qr(matrix[:, ::-1])
-    Q = flipped[:, ::-1]
-    return Q * np.sign(np.diag(Q.T @ matrix))

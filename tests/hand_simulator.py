@@ -31,41 +31,20 @@ GRAVITY_DPS = np.degrees(1.0)
 class Hand:
     """How a recording is made.
 
-    Attributes
-    ----------
-    rests : int
-    rest_s, move_s : float, s
-        Of typical length; each is drawn between 0.8 and 1.3 times.
-    rate_hz : float
-    vertical : float
-        Share of moves about the vertical.
-    tail_dps : (float, float)
-        Rate at which a move ends; 0 for none.
-    creep_dps : float
-        Standard deviation of the rate at which a unit turns in a rest, about each axis; at most 0.3.
-    settle_deg : float
-        Standard deviation, per axis, of an angle by which each move is wrongly known: what its ends are off gravity.
-    slow_s : float, s
-        Time constant of a filter of first order in the accelerometer, before its noise; 0 for none.
-    jitter : float
-        Share of a sampling interval by which stamps are late, at most; they come in bursts of three.
-    white : dict of str to float
-        Standard deviation of a sample, g and deg/s.
-    effects : dict
-        ``quadratic`` ((3,), 1/g) and ``drift`` ((3,), g/s) of the accelerometer; ``g_sensitivity`` ((3, 3),
-        deg/s/g) and ``gyro_drift`` ((3,), deg/s/s) of the gyroscope.
+    ``white``: standard deviation of a sample, g and deg/s. ``effects``: ``quadratic`` ((3,), 1/g) and ``drift`` ((3,),
+    g/s) of the accelerometer, ``g_sensitivity`` ((3, 3), deg/s/g) and ``gyro_drift`` ((3,), deg/s/s) of the gyroscope.
     """
 
     rests: int = 40
-    rest_s: float = 4.0
-    move_s: float = 1.6
+    rest_s: float = 4.0  # typical; each is drawn between 0.8 and 1.3 times
+    move_s: float = 1.6  # likewise
     rate_hz: float = 100.0
-    vertical: float = 0.0
-    tail_dps: tuple[float, float] = (0.0, 0.0)
-    creep_dps: float = 0.0
-    settle_deg: float = 0.0
-    slow_s: float = 0.0
-    jitter: float = 0.0
+    vertical: float = 0.0  # share of moves about the vertical
+    tail_dps: tuple[float, float] = (0.0, 0.0)  # rate at which a move ends; 0 for none
+    creep_dps: float = 0.0  # standard deviation of the rate in a rest, about each axis; at most 0.3
+    settle_deg: float = 0.0  # standard deviation, per axis, of what the ends of each move are off gravity
+    slow_s: float = 0.0  # time constant of a first-order filter in the accelerometer, before its noise; 0 for none
+    jitter: float = 0.0  # share of a sampling interval by which stamps are late, at most; they come in bursts of three
     wander: dict[str, float] = field(default_factory=lambda: {"accelerometer": 1e-4, "gyroscope": 3e-3})
     white: dict[str, float] = field(default_factory=lambda: {"accelerometer": 2.8e-3, "gyroscope": 0.035})
     effects: dict[str, Any] = field(default_factory=dict)
@@ -106,7 +85,6 @@ def level_up(q: Array) -> Array:
 
 
 def draw(hand: Hand, seed: int) -> Drawn:
-    """Draw a unit and its recording."""
     return draw_together(hand, seed, 1)[0]
 
 

@@ -61,7 +61,6 @@ def make_recording(samples: int = 200, start_ns: int = 0, seed: int = 1, name: s
 
 
 def channels(recording: Recording) -> dict[str, Any]:
-    """Return every channel of a recording."""
     names = ("time_ns", "accelerometer", "gyroscope", "temperature", "table_angle", "table_rate", "table_attitude")
     return {n: getattr(recording, n) for n in (*names, "flags")}
 

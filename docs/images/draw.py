@@ -24,6 +24,7 @@ INK, GREY, TURN, FILL = "#1f2937", "#6b7280", "#b45309", ("#e5e7eb", "#f3f4f6", 
 FONT = 'font-family="sans-serif"'
 AZIMUTH_DEG, ELEVATION_DEG = -55.0, 24.0  # from where the unit is seen
 HALF = np.array([0.62, 0.42, 0.2])  # edges of the case
+VERTICAL = np.array([0.0, 0.0, 1.0])
 Array = np.ndarray
 
 
@@ -97,6 +98,13 @@ def unit(picture: Picture, level: Array, centre: tuple[float, float], scale: flo
         picture.text(x, y + 5, name, 15, stroke="#fff", stroke_width="5", paint_order="stroke")
 
 
+def turn_axis(
+    picture: Picture, along: Array, ends: tuple[float, float], centre: tuple[float, float], scale: float
+) -> None:
+    """Draw a dashed line along a level direction, between two distances from the centre."""
+    picture.line(place(np.outer(ends, along), centre, scale), TURN, 1.5, stroke_dasharray="6 4")
+
+
 def turn_arrow(picture: Picture, axis: Array, at: float, centre: tuple[float, float], scale: float) -> None:
     """Draw a right-handed arrow about a level direction, at a distance from the centre."""
     first = np.cross(axis, [0.3, 0.2, 1.0])
@@ -132,8 +140,7 @@ def mounting(picture: Picture, *, one_axis: bool) -> None:
             heading = np.degrees(np.arctan2(along[1], along[0]))
             level = rotation(2, -heading) @ level
         along = level[:, axis]
-        ends = place(np.array([-1.6 * along, 1.9 * along]), centre, 80.0)
-        picture.line(ends, TURN, 1.5, stroke_dasharray="6 4")
+        turn_axis(picture, along, (-1.6, 1.9), centre, 80.0)
         unit(picture, level, centre, 80.0)
         turn_arrow(picture, along, 1.9, centre, 80.0)
         what = f"accel_{name}, gyro_{name}" if one_axis else f"turn about {name}"
@@ -144,16 +151,16 @@ def mounting(picture: Picture, *, one_axis: bool) -> None:
 
 def benches(picture: Picture) -> None:
     """Draw the kinds of benches: their turn axes, and the setting of each."""
-    level, upward = turned(0, 0.0), np.eye(3)[2]
+    level = turned(0, 0.0)
     for k, (title, axes, settings) in enumerate((
         ("three turn axes", np.eye(3), ("table=acutronic, or your own", "mounted once for all turns")),
         ("one level turn axis", level[:, :1].T, ("table=single_axis", "mounted anew for each turn")),
-        ("a vertical turn axis", upward[None], ("procedure.recordings.gyro_z.up=+z", "gyroscope alone")),
+        ("a vertical turn axis", VERTICAL[None], ("procedure.recordings.gyro_z.up=+z", "gyroscope alone")),
         ("no table", np.zeros((0, 3)), ("table=hand", "rests, moves and turns by hand")),
     )):  # fmt: skip
         centre = (130.0 + 260.0 * k, 175.0)
         for along in axes:
-            picture.line(place([-1.4 * along, 1.7 * along], centre, 75.0), TURN, 1.5, stroke_dasharray="6 4")
+            turn_axis(picture, along, (-1.4, 1.7), centre, 75.0)
         tilted = level if len(axes) else level @ rotation(1, 35.0) @ rotation(0, -20.0)
         unit(picture, tilted, centre, 75.0)
         for along in axes:
@@ -173,7 +180,7 @@ def attitudes(picture: Picture) -> None:
         size = float(np.linalg.norm(about))
         if size > 0.0:
             level = level @ rotation_about(about / size, np.degrees([np.arctan2(size, level[2] @ up)]))[0].T
-        picture.line(place([[0, 0, -1.25], [0, 0, 1.45]], centre, 75.0), TURN, 1.5, stroke_dasharray="6 4")
+        turn_axis(picture, VERTICAL, (-1.25, 1.45), centre, 75.0)
         unit(picture, level, centre, 75.0)
         for row, words in enumerate(in_words(up).replace(", ", ",|").replace(" raised", "|raised").split("|")):
             picture.text(centre[0], 306 + 19 * row, words, 13, "#374151")
@@ -189,16 +196,11 @@ def ferraris(picture: Picture) -> None:
         picture.text(centre[0], 232, f"{axis_of(face(axis, sign)[2])} up", 14, "#374151")
     for axis in range(3):
         centre = (150.0 + 300.0 * axis, 425.0)
-        picture.line(place([[0, 0, -1.2], [0, 0, 2.1]], centre, 60.0), TURN, 1.5, stroke_dasharray="6 4")
+        turn_axis(picture, VERTICAL, (-1.2, 2.1), centre, 60.0)
         unit(picture, face(axis, 1.0), centre, 60.0)
-        turn_arrow(picture, np.array([0.0, 0.0, 1.0]), 1.95, centre, 60.0)
-        picture.text(
-            centre[0],
-            528,
-            f"turn about {'xyz'[axis]}: 360 deg and back, {axis_of(face(axis, 1.0)[2])} up",
-            14,
-            "#374151",
-        )
+        turn_arrow(picture, VERTICAL, 1.95, centre, 60.0)
+        words = f"turn about {'xyz'[axis]}: 360 deg and back, {axis_of(face(axis, 1.0)[2])} up"
+        picture.text(centre[0], 528, words, 14, "#374151")
     picture.text(450, 26, "rests on the six faces", 17, font_weight="bold")
     picture.text(450, 276, "turns about the vertical, from rest to rest", 17, font_weight="bold")
 
@@ -245,14 +247,12 @@ def session(picture: Picture) -> None:
         picture.text(370, 280 + 26 * row, note, 14, "#374151", text_anchor="start")
     total = sum(t.duration + course.pause_s for t in planned.values())
     start = course.pause_s
-    picture.text(
-        60, 440, f"the session: {total / 60:.1f} min from power-on", 14, text_anchor="start", font_weight="bold"
-    )
+    title = f"the session: {total / 60:.1f} min from power-on"
+    picture.text(60, 440, title, 14, text_anchor="start", font_weight="bold")
     for name, trajectory in planned.items():
         x, width = 60 + 860 * start / total, 860 * trajectory.duration / total
-        picture.line(
-            [(x, 455), (x + width, 455), (x + width, 481), (x, 481), (x, 455)], GREY, 1, fill=FILL[name[0] == "g"]
-        )
+        box = [(x, 455), (x + width, 455), (x + width, 481), (x, 481), (x, 455)]
+        picture.line(box, GREY, 1, fill=FILL[name[0] == "g"])
         picture.text(x + width / 2, 472, name, 11)
         start += trajectory.duration + course.pause_s
 

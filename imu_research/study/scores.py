@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
-import scipy
 
-from imu_research.figures import MeasuredFigure, clustered_share, share
+from imu_research.figures import MeasuredFigure, clopper_pearson, clustered_share, share
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.gates import MIN_DELTA_BIC, MIN_DELTA_BIC_OF_SLOW
 from pipeline.output.pages.chart import Dots, Figure, LineMark, Panel, chart
@@ -213,7 +212,7 @@ def false_selections(cases: Iterable[ScoredCase]) -> list[list[Any]]:
     """
     rows = []
     for (*row, kind), gains in sorted(_largest_gains(cases).items(), reverse=True):
-        low, high = _exact(_passing(gains, kind), len(gains))
+        low, high = clopper_pearson(_passing(gains, kind), len(gains))
         counts = [sum(gain > gate for gain in gains) for gate in GATES]
         rows.append([*row, kind, len(gains), *counts, f"{100 * low:.3f} to {100 * high:.2f} %"])
     return rows
@@ -231,7 +230,7 @@ def false_selection_rates(cases: Iterable[ScoredCase]) -> list[MeasuredFigure]:
             _passing(gains, kind) / len(gains),
             len(gains),
             "<= 0.1 %",
-            _exact(_passing(gains, kind), len(gains)),
+            clopper_pearson(_passing(gains, kind), len(gains)),
         )
         for (recorded, kind), gains in sorted(found.items())
     ]
@@ -256,11 +255,6 @@ def _largest_gains(cases: Iterable[ScoredCase]) -> dict[tuple[str, str, str], li
 
 def _passing(gains: Iterable[float], kind: str) -> int:
     return sum(gain > (MIN_DELTA_BIC_OF_SLOW if kind == "slow" else MIN_DELTA_BIC) for gain in gains)
-
-
-def _exact(count: int, total: int) -> tuple[float, float]:
-    ends = scipy.stats.binomtest(count, total).proportion_ci(0.95, method="exact")
-    return float(ends.low), float(ends.high)
 
 
 def mean_excess_gone(cases: Iterable[ScoredCase]) -> list[MeasuredFigure]:
@@ -368,6 +362,13 @@ def reliability(cases: Sequence[ScoredCase], of: Probability = "effects") -> lis
             true = [np.array([t for _, t in each]) for each in inside]
             rows += clustered_share(f"{mean:.4f}", true, f"contains {100.0 * mean:.4g} %")
     return rows
+
+
+def stated_shares(cases: Sequence[ScoredCase]) -> list[MeasuredFigure]:
+    """Return the bins of ``reliability`` of all probabilities, each with a name that says of what it is."""
+    return [
+        figure._replace(name=f"{of}, stated {figure.name}") for of in PROBABILITIES for figure in reliability(cases, of)
+    ]
 
 
 def reliability_diagram(cases: Sequence[ScoredCase]) -> str:

@@ -51,6 +51,7 @@ METRICS = {
 }
 APPLIED = "by the printed parameters, applied to our held-out motion"
 STAGE_OF_LETTER = {"O": "orthogonality", "M": "misalignment", "b": "bias", "S": "scale_factor"}
+CHOLESKY_AS_PRINTED = "as printed: Cholesky and LU's forward matrix applied as if it were the correction"
 # The comparison of methods: its two methods, for the thesis as printed and with errata corrected.
 COMPARED_FIGURES = {
     "accelerometer": {
@@ -58,9 +59,7 @@ COMPARED_FIGURES = {
         "by the staged method with its errata corrected": ("staged", "least-squares"),
     },
     "gyroscope": {
-        "as printed: Cholesky and LU's forward matrix applied as if it were the correction": (
-            *("staged", "cholesky-printed"),
-        ),
+        CHOLESKY_AS_PRINTED: ("staged", "cholesky-printed"),
         "inverted: Cholesky and LU's matrix as it is meant": ("staged", "cholesky"),
     },
 }
@@ -291,14 +290,12 @@ def _paper_tables(printed: Path, results: Results) -> Cells:
     """Yield the cells of tables 1 to 4 of the conference paper."""
     by_table = dict(iter(read_printed(printed, "conference_paper").groupby("table")))
     positions = read_printed(printed, "conference_paper_six_positions")
+    turns = "GY-521, gyroscope: error of the integrated angle, row i in the turn about axis i"
     for table, title, rows in (
         ("paper 1", "GY-521, 24 orientations: nonlinear least squares", _paper_1(by_table["1"], results)),
         ("paper 2", "GY-521, 24 orientations, judged in six positions", _paper_2(positions, results)),
         ("paper 3", "GY-521, gyroscope: Cholesky and LU", _paper_3(by_table["3"], results)),
-        (
-            *("paper 4", "GY-521, gyroscope: error of the integrated angle, row i in the turn about axis i"),
-            _paper_4(by_table["4"], results),
-        ),
+        ("paper 4", turns, _paper_4(by_table["4"], results)),
     ):
         columns = AXES if table == "paper 4" else ["GY-521"]
         for row, printed_values, ours, digits in rows:

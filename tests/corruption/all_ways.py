@@ -62,21 +62,12 @@ def _expanded(kind: str, entry: dict[str, Any]) -> list[Way]:
     return [Way(kind, function, dict(zip(parameters, one, strict=True)), bases) for one in itertools.product(*lists)]
 
 
-def corrupted(number: int, seed: int, ways: list[Way], pairs: float = 0.5) -> Copy:
-    """Return unit ``number``: way by way, then at random, some with a second way on top.
-
-    Parameters
-    ----------
-    number, seed : int
-        They determine it.
-    ways : list of Way
-    pairs : float
-        Share of the units beyond the first round that are changed in two ways.
-    """
+def corrupted(number: int, seed: int, ways: list[Way]) -> Copy:
+    """Return unit ``number``: way by way, then at random, half of them with a second way on top."""
     rng = np.random.default_rng([seed, number])
     first = ways[_in_turn(ways, seed)[number]] if number < len(ways) else ways[int(rng.integers(len(ways)))]
     chosen = [first]
-    if number >= len(ways) and rng.random() < pairs:
+    if number >= len(ways) and rng.random() < 0.5:
         chosen.append(ways[int(rng.integers(len(ways)))])
     for _ in range(20):
         common = [b for b in BASES if all(b in way.bases for way in chosen)]

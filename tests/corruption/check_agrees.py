@@ -40,7 +40,7 @@ SHEETS = {  # campaign that ships, and its unit
     "published mpu6050": "mpu6050",
     "published wearable": "wearable",
 }
-UNTIL = ("ingest", "filter", "fit", "validate", "calibration")
+UNTIL = ("ingest", "filter", "fit", "validate", "diagnose", "calibration")
 MANY_U, MANY_FLOORS = 5.0, 3.0
 Rows = list[list[str]]
 
@@ -83,10 +83,8 @@ def _middle(log: Log) -> int:
 
 
 def scaled(log: Log) -> None:
-    column, factor = (
-        log.some(),
-        float(log.rng.choice([0.001, 0.01745329, 1 / 6, 0.5, 2.0, 9.80665, 57.29578, 1000.0, -1.0])),
-    )
+    column = log.some()
+    factor = float(log.rng.choice([0.001, 0.01745329, 1 / 6, 0.5, 2.0, 9.80665, 57.29578, 1000.0, -1.0]))
     log.said += f" x {factor:.4g}"
     log.put(column, factor * log.numbers(column))
 
@@ -140,12 +138,8 @@ def time_restarts(log: Log) -> None:
 
 def time_wraps(log: Log) -> None:
     time = log.numbers(0)
-    log.put(
-        0,
-        np.where(
-            np.arange(len(time)) >= _middle(log), time - (2.0**32 if time[1] - time[0] > 1 else 2.0**32 / 1e6), time
-        ),
-    )
+    counter = 2.0**32 if time[1] - time[0] > 1 else 2.0**32 / 1e6
+    log.put(0, np.where(np.arange(len(time)) >= _middle(log), time - counter, time))
 
 
 def time_rounded(log: Log) -> None:
@@ -190,10 +184,8 @@ def rows_exchanged(log: Log) -> None:
 
 
 def cells_replaced(log: Log) -> None:
-    column, text = (
-        log.some(),
-        str(log.rng.choice(["", "nan", "NULL", "inf", "-", "0", "1e999", "0x1F", "1,5", "1'000"])),
-    )
+    column = log.some()
+    text = str(log.rng.choice(["", "nan", "NULL", "inf", "-", "0", "1e999", "0x1F", "1,5", "1'000"]))
     log.said += f" {text!r}"
     for k in log.rng.integers(1, len(log.rows), int(log.rng.choice([1, 5, 200]))):
         log.rows[int(k)][column] = text

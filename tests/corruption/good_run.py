@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from imu_research.figures import wilson
 from imu_research.study.cases import FAMILIES, draw
-from imu_research.study.run import diagnose_case
+from imu_research.study.run import diagnose_case, read_lines
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS
 
@@ -88,7 +88,7 @@ def main() -> int:
     parser.add_argument("--cores", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    lines = [json.loads(x) for x in options.out.read_text().splitlines()] if options.out.is_file() else []
+    lines = read_lines(options.out)
     done = {(x["family"], x["number"], x["seed"]) for x in lines}
     wanted = [(FAMILIES[k % len(FAMILIES)], k // len(FAMILIES), options.seed) for k in range(options.units)]
     wanted = [item for item in wanted if item not in done]

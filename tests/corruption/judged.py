@@ -18,7 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from imu_research.figures import MeasuredFigure, wilson
+
 if TYPE_CHECKING:
+    from collections import Counter
     from pathlib import Path
 
     from unit_copy import Copy, Truth
@@ -79,6 +82,16 @@ def judge(copy: Copy, results: Path) -> list[Judgement]:
     return out
 
 
+def shares_of(outcomes: Counter[str]) -> list[MeasuredFigure]:
+    """Return the share of each outcome among the sensors of corrupted units; the goal is that none is silent."""
+    total = outcomes.total()
+    goals = {SILENT: "<= 0 %"}
+    return [
+        MeasuredFigure(f"corrupted: {o}", outcomes[o] / total, total, goals.get(o, ""), wilson(outcomes[o], total))
+        for o in OUTCOMES
+    ]
+
+
 def refused(copy: Copy, message: str) -> list[Judgement]:
     """Return the judgement of a unit whose configuration is refused."""
     return [_judged(copy, sensor, REFUSED, "bad_configuration", (), message) for sensor in copy.truth]
@@ -106,10 +119,7 @@ def _wrong_parameters(found: Any, truth: Truth, turn: np.ndarray) -> str:
     worst, where = 0.0, ""
     for name, true in (("bias", truth.bias), ("matrix", turn @ truth.matrix)):
         off = np.abs(np.array(found[name]) - true)
-        stated = np.array(
-            [[np.nan if u is None else u for u in np.atleast_1d(row)] for row in found["expanded_uncertainty"][name]],
-            float,
-        ).reshape(off.shape)
+        stated = np.array(found["expanded_uncertainty"][name], float)  # None: nan
         ratio = off / np.maximum(np.nan_to_num(stated), LEAST_U)
         at = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
         if ratio[at] > worst:

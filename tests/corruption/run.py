@@ -22,10 +22,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from all_ways import corrupted, single_ways
 from good_bench import BASES, good_unit
-from judged import OUTCOMES, SILENT, Judgement, judge, refused
+from judged import OUTCOMES, SILENT, Judgement, judge, refused, shares_of
 from unit_copy import TIME, Copy, NotApplicableError, write
 
-from imu_research.figures import MeasuredFigure, wilson, write_figures
+from imu_research.figures import write_figures
 from pipeline.app.config import load_campaign
 from pipeline.core.errors import PipelineError
 
@@ -48,22 +48,16 @@ def main() -> int:
     text = report(judgements, options.seed)
     (out / "table.txt").write_text(text, encoding="utf-8")
     sys.stdout.write(text)
-    if options.figures:
-        write_figures(options.figures, figures(judgements))
+    write_figures(options.figures, shares_of(Counter(j.outcome for j in judgements if not j.harmless)))
     return int(any(j.outcome == SILENT for j in judgements))
 
 
 def parsed() -> argparse.Namespace:
-    """Return the options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--units", type=int, default=170, help="corrupted units; the first go through all ways, class by class")
-    add(
-        "--start",
-        type=int,
-        default=0,
-        help="number of the first; beyond the ways, units are random, some changed twice",
-    )
+    words = "number of the first; beyond the ways, units are random, some changed twice"
+    add("--start", type=int, default=0, help=words)
     add("--seed", type=int, default=1)
     add("--good", type=int, default=0, help="units that are not corrupted, beside them")
     add("--only", nargs="+", default=[], metavar="UNIT", help="only these units of the draw")
@@ -74,23 +68,7 @@ def parsed() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def figures(judgements: list[Judgement]) -> list[MeasuredFigure]:
-    """Return the share of each outcome among the sensors of corrupted units; the goal is that none is silent."""
-    found = [j.outcome for j in judgements if not j.harmless]
-    return [
-        MeasuredFigure(
-            f"corrupted: {outcome}",
-            found.count(outcome) / len(found),
-            len(found),
-            "<= 0 %" if outcome == SILENT else "",
-            wilson(found.count(outcome), len(found)),
-        )
-        for outcome in OUTCOMES
-    ]
-
-
 def drawn(options: argparse.Namespace) -> list[Copy]:
-    """Return the units of a draw."""
     ways = single_ways()
     copies = []
     for number in range(options.start, options.start + options.units):
@@ -106,12 +84,8 @@ def drawn(options: argparse.Namespace) -> list[Copy]:
             copies.append(copy)
     bases = list(BASES)
     for number in range(options.good):
-        copy = good_unit(
-            bases[number % len(bases)],
-            900_000 + 1000 * options.seed + number,
-            f"good{number:03d}",
-            varied=number >= len(bases),
-        )
+        base, seed = bases[number % len(bases)], 900_000 + 1000 * options.seed + number
+        copy = good_unit(base, seed, f"good{number:03d}", varied=number >= len(bases))
         copy.kind, copy.way, copy.harmless = "(not corrupted)", "good", True
         copies.append(copy)
     return copies
@@ -126,7 +100,7 @@ def _writable(copy: Copy) -> Copy:
     return copy
 
 
-def by_snakemake(campaign: Path, results: Path, cores: int = 1) -> None:
+def by_snakemake(campaign: Path, results: Path, cores: int) -> None:
     """Calibrate a campaign by the real command."""
     settings = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [Path(sys.executable).with_name("snakemake"), "--cores", cores, "--quiet", "all"]
@@ -137,7 +111,7 @@ def by_snakemake(campaign: Path, results: Path, cores: int = 1) -> None:
         )
 
 
-def run(copies: list[Copy], out: Path, calibrate: Callable[[Path, Path], object] = by_snakemake) -> list[Judgement]:
+def run(copies: list[Copy], out: Path, calibrate: Callable[[Path, Path], object]) -> list[Judgement]:
     """Write the campaign, calibrate it, and judge every unit."""
     campaign = out / "corrupted"
     judgements, rows, kept = [], [], []
@@ -160,7 +134,6 @@ def run(copies: list[Copy], out: Path, calibrate: Callable[[Path, Path], object]
 
 
 def sheet(campaign: Path, rows: list[dict[str, str]]) -> None:
-    """Write units.csv."""
     campaign.mkdir(parents=True, exist_ok=True)
     with (campaign / "units.csv").open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS, restval="")

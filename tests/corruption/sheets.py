@@ -27,10 +27,10 @@ import pandas as pd
 sys.path.insert(0, str(Path(__file__).parents[2]))
 sys.path.insert(0, str(Path(__file__).parent))
 
-from judged import DOUBTFUL, LEAST_U, MANY_U, MARKED, NAMED, OUTCOMES, REFUSED, RIGHT, SILENT, UNSEEN
+from judged import DOUBTFUL, LEAST_U, MANY_U, MARKED, NAMED, OUTCOMES, REFUSED, RIGHT, SILENT, UNSEEN, shares_of
 from unit_copy import ANGLE, COLUMNS, RATE, TEMPERATURE, TIME, NotApplicableError
 
-from imu_research.figures import MeasuredFigure, wilson, write_figures
+from imu_research.figures import write_figures
 from pipeline.app.one_unit import try_unit, unit_without_campaign
 from pipeline.core.errors import PipelineError
 from tests.study.listed_recordings import KINDS, WHITE, Unit
@@ -96,7 +96,6 @@ class Recorded:
                 self.unseen = "a unit at rest shows neither scale factor nor sign of its gyroscope"
 
     def write(self) -> None:
-        """Write files and sheet."""
         for name, table in self.files.items():
             table.to_csv(self.unit.folder / f"{name}.csv", index=False, float_format="%.10g")
         (self.unit.folder / "recordings.csv").write_text("\n".join(map(",".join, self.rows)) + "\n")
@@ -357,15 +356,9 @@ def main() -> int:
             for outcome, line in outcomes:
                 count[outcome] += 1
                 sys.stdout.write(f"{outcome}: {line}"[:300] + "\n")
-    total = count.total()
-    sys.stdout.write(", ".join(f"{outcome} {count[outcome]}" for outcome in OUTCOMES) + f" of {total} sensors\n")
-    if options.figures:
-        goals = {SILENT: "<= 0 %"}
-        figures = [
-            MeasuredFigure(f"corrupted: {o}", count[o] / total, total, goals.get(o, ""), wilson(count[o], total))
-            for o in OUTCOMES
-        ]
-        write_figures(options.figures, figures)
+    outcomes = ", ".join(f"{outcome} {count[outcome]}" for outcome in OUTCOMES)
+    sys.stdout.write(f"{outcomes} of {count.total()} sensors\n")
+    write_figures(options.figures, shares_of(count))
     return int(bool(count[SILENT]))
 
 

@@ -1,12 +1,11 @@
 """A unit on its way to be corrupted: its files as tables, the truth behind them, and how they are written.
 
 A table maps the columns of the canonical CSV to their values. The writers are not the product's: text by numpy, MCAP by
-the library ``mcap`` with messages packed here.
+the libraries ``mcap`` and ``rosbags``.
 """
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
+from rosbags.typesys import Stores, get_typestore
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -40,21 +40,7 @@ class Truth:
 
 @dataclass
 class Copy:
-    """A unit: good at first, then corrupted in one or two ways.
-
-    Attributes
-    ----------
-    causes : set of str
-        Effects of which one may truthfully be named as the cause of what was changed.
-    unseen : str
-        Why no logged channel reveals the change; empty where one does.
-    harmless : bool
-        Whether the change leaves all results right, so that a refusal would be needless.
-    leaked : bool
-        Whether the held-out motion shares samples with a fit.
-    said : dict
-        What was drawn at random, for the report.
-    """
+    """A unit: good at first, then corrupted in one or two ways."""
 
     name: str
     base: str
@@ -67,12 +53,12 @@ class Copy:
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
     row: dict[str, str] = field(default_factory=dict)
     overrides: list[str] = field(default_factory=list)
-    causes: set[str] = field(default_factory=set)
-    unseen: str = ""
-    harmless: bool = False
-    leaked: bool = False
+    causes: set[str] = field(default_factory=set)  # effects that may truthfully be named for what was changed
+    unseen: str = ""  # why no logged channel reveals the change; empty where one does
+    harmless: bool = False  # whether the change leaves all results right, so that a refusal would be needless
+    leaked: bool = False  # whether the held-out motion shares samples with a fit
     log_stamps: dict[str, float] = field(default_factory=dict)  # MCAP: seconds added to the stamps of a kind of message
-    said: dict[str, Any] = field(default_factory=dict)
+    said: dict[str, Any] = field(default_factory=dict)  # what was drawn at random, for the report
     way: str = ""
     kind: str = ""
 
@@ -99,6 +85,10 @@ class Copy:
         if found not in self.tables:
             raise NotApplicableError(f"{self.base} has no {found}")
         return [found]
+
+    def chosen(self, scope: str) -> list[Table]:
+        """Return the tables of the recordings that a scope means."""
+        return [self.tables[name] for name in self.recordings(scope)]
 
     def map_readings(self, scope: str, sensor: str, A: np.ndarray) -> None:
         """Replace readings by A @ reading; in all files the truth is that of the new readings."""
@@ -127,9 +117,13 @@ def values(table: Table, columns: Iterable[str]) -> np.ndarray:
 
 
 def put(table: Table, columns: Iterable[str], new: np.ndarray) -> None:
-    """Set columns."""
     for column, each in zip(columns, np.asarray(new, float).T, strict=True):
         table[column] = each
+
+
+def add(table: Table, sensor: str, change: np.ndarray) -> None:
+    """Add to the readings of a sensor."""
+    put(table, COLUMNS[sensor], values(table, COLUMNS[sensor]) + change)
 
 
 def rows_of(table: Table, chosen: np.ndarray) -> Table:
@@ -156,7 +150,6 @@ def table_of(recording: Any) -> Table:
 
 
 def write(copy: Copy, folder: Path) -> None:
-    """Write the recordings of a unit."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, table in copy.tables.items():
         if copy.format == "mcap":
@@ -167,113 +160,60 @@ def write(copy: Copy, folder: Path) -> None:
 
 def _write_csv(path: Path, table: Table) -> None:
     formats = ["%.15g" if column == TIME else "%.10g" for column in table]
-    matrix = np.stack(list(table.values()), axis=1)
-    with path.open("w", encoding="utf-8") as stream:
-        stream.write(",".join(table) + "\n")
-        row = ",".join(formats) + "\n"
-        stream.writelines(row % tuple(line) for line in matrix.tolist())
+    rows = np.stack(list(table.values()), axis=1)
+    np.savetxt(path, rows, formats, delimiter=",", header=",".join(table), comments="")
 
 
-_HEADER = """std_msgs/Header header
-"""
-_COMMON = """================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-_QUATERNION = """================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-"""
-_VECTOR = """================================================================================
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-"""
-SCHEMAS = {
-    "sensor_msgs/msg/Imu": _HEADER
-    + """geometry_msgs/Quaternion orientation
-float64[9] orientation_covariance
-geometry_msgs/Vector3 angular_velocity
-float64[9] angular_velocity_covariance
-geometry_msgs/Vector3 linear_acceleration
-float64[9] linear_acceleration_covariance
-"""
-    + _COMMON
-    + _QUATERNION
-    + _VECTOR,
-    "sensor_msgs/msg/Temperature": _HEADER + "float64 temperature\nfloat64 variance\n" + _COMMON,
-    "sensor_msgs/msg/JointState": _HEADER
-    + "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
-    + _COMMON,
-    "geometry_msgs/msg/QuaternionStamped": _HEADER + "geometry_msgs/Quaternion quaternion\n" + _COMMON + _QUATERNION,
-}
-_HEAD = "<4siII4s"  # encapsulation, stamp, frame id "imu"
-PACKED = {
-    "sensor_msgs/msg/Imu": struct.Struct(_HEAD + "37d"),
-    "sensor_msgs/msg/Temperature": struct.Struct(_HEAD + "2d"),
-    "geometry_msgs/msg/QuaternionStamped": struct.Struct(_HEAD + "4d"),
-}
+STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def _write_mcap(path: Path, table: Table, shifted: dict[str, float]) -> None:
-    streams = _messages(table)
+    types = STORE.types
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2", library="tests")
         items = []
-        for kind, (packed, rows) in streams.items():
-            schema = writer.register_schema(kind, SchemaEncoding.ROS2, SCHEMAS[kind].encode())
+        for kind, contents in _messages(table).items():
+            definition, _ = STORE.generate_msgdef(kind, ros_version=2)
+            schema = writer.register_schema(kind, SchemaEncoding.ROS2, definition.encode())
             topic = "/" + kind.rpartition("/")[2].lower()
             channel = writer.register_channel(topic, MessageEncoding.CDR, schema)
             times = np.round((table[TIME] + shifted.get(kind, 0.0)) * 1e9).astype(np.int64).tolist()
             stamps = np.round(table[TIME] * 1e9).astype(np.int64).tolist()
-            for time, log, numbers in zip(times, stamps, rows, strict=True):
-                head = (b"\x00\x01\x00\x00", time // 10**9, time % 10**9, 4, b"imu\0")
-                items.append((log, channel, time, packed(head, numbers)))
+            for time, log, content in zip(times, stamps, contents, strict=True):
+                stamp = types["builtin_interfaces/msg/Time"](time // 10**9, time % 10**9)
+                header = types["std_msgs/msg/Header"](stamp, "imu")
+                message = types[kind](header=header, **content)
+                items.append((log, channel, time, bytes(STORE.serialize_cdr(message, kind))))
         for sequence, (log, channel, time, data) in enumerate(sorted(items, key=lambda item: item[0])):
             writer.add_message(channel, max(log, 0), data, max(time, 0), sequence)
         writer.finish()
 
 
-def _messages(table: Table) -> dict[str, tuple[Any, list[Any]]]:
-    """Return how each kind of message is packed, and the numbers of each row."""
-    n = len(table[TIME])
-    imu = np.zeros((n, 37))
-    imu[:, 3], imu[:, 4] = 1.0, -1.0  # no orientation
-    imu[:, 13:16] = np.radians(values(table, GYROSCOPE))
-    imu[:, 25:28] = values(table, ACCELEROMETER) * STANDARD_GRAVITY
-    found = {"sensor_msgs/msg/Imu": imu}
+def _messages(table: Table) -> dict[str, list[dict[str, Any]]]:
+    """Return the fields of each message but its header, by kind."""
+    vector, quaternion = (STORE.types[f"geometry_msgs/msg/{kind}"] for kind in ("Vector3", "Quaternion"))
+    same = {f"{name}_covariance": np.zeros(9) for name in ("angular_velocity", "linear_acceleration")}
+    same |= {"orientation": quaternion(0.0, 0.0, 0.0, 1.0)}
+    same |= {"orientation_covariance": np.repeat([-1.0, 0.0], [1, 8])}  # no orientation
+    rates, forces = np.radians(values(table, GYROSCOPE)), values(table, ACCELEROMETER) * STANDARD_GRAVITY
+    found: dict[str, list[dict[str, Any]]] = {
+        "sensor_msgs/msg/Imu": [
+            {"angular_velocity": vector(*rate), "linear_acceleration": vector(*force), **same}
+            for rate, force in zip(rates.tolist(), forces.tolist(), strict=True)
+        ]
+    }
     if TEMPERATURE in table:
-        found["sensor_msgs/msg/Temperature"] = np.stack([table[TEMPERATURE], np.zeros(n)], axis=1)
+        temperatures = table[TEMPERATURE].tolist()
+        found["sensor_msgs/msg/Temperature"] = [{"temperature": t, "variance": 0.0} for t in temperatures]
     if ATTITUDE[0] in table:
-        found["geometry_msgs/msg/QuaternionStamped"] = values(table, [*ATTITUDE[1:], ATTITUDE[0]])
-    packers = {kind: _plain(PACKED[kind]) for kind in found}
+        rows = values(table, [*ATTITUDE[1:], ATTITUDE[0]]).tolist()
+        found["geometry_msgs/msg/QuaternionStamped"] = [{"quaternion": quaternion(*row)} for row in rows]
     if ANGLE in table or RATE in table:
-        found["sensor_msgs/msg/JointState"] = np.radians(values(table, [c for c in (ANGLE, RATE) if c in table]))
-        packers["sensor_msgs/msg/JointState"] = _joint(ANGLE in table, RATE in table)
-    return {kind: (packers[kind], rows.tolist()) for kind, rows in found.items()}
-
-
-def _plain(packing: struct.Struct) -> Any:
-    return lambda head, numbers: packing.pack(*head, *numbers)
-
-
-def _joint(*present: bool) -> Any:
-    """Return what packs a joint's message: its name, then position and velocity, each a list of one number or none."""
-    if all(present):
-        both = struct.Struct(_HEAD + "II6s2xI4xdI4xdI")
-        return lambda head, n: both.pack(*head, 1, 6, b"table\0", 1, n[0], 1, n[1], 0)
-    if present[0]:
-        angle = struct.Struct(_HEAD + "II6s2xI4xdII")
-        return lambda head, n: angle.pack(*head, 1, 6, b"table\0", 1, n[0], 0, 0)
-    rate = struct.Struct(_HEAD + "II6s2xIIdI")
-    return lambda head, n: rate.pack(*head, 1, 6, b"table\0", 0, 1, n[0], 0)
+        none = np.zeros((len(table[TIME]), 0))
+        joint = [np.radians(table[c])[:, None] if c in table else none for c in (ANGLE, RATE)]
+        found["sensor_msgs/msg/JointState"] = [
+            {"name": ["table"], "position": position, "velocity": velocity, "effort": np.zeros(0)}
+            for position, velocity in zip(*joint, strict=True)
+        ]
+    return found

@@ -14,6 +14,7 @@ from unit_copy import (
     Copy,
     NotApplicableError,
     Table,
+    add,
     put,
     rows_of,
     values,
@@ -63,11 +64,7 @@ def tilted_table(copy: Copy, scope: str, degrees: float) -> None:
         a = rotation_about(np.eye(3)[axis], -table[ANGLE])
         up = np.eye(3)[2 if axis < 2 else 0]
         change = np.einsum("nij,j->ni", a, tilt @ up - up)
-        put(
-            table,
-            COLUMNS["accelerometer"],
-            values(table, COLUMNS["accelerometer"]) + change @ np.linalg.inv(truth.matrix).T,
-        )
+        add(table, "accelerometer", change @ np.linalg.inv(truth.matrix).T)
     copy.causes |= {"table_tilt", "mounting", "encoder_zero", "table_axis_nonorthogonality"}
 
 
@@ -114,7 +111,7 @@ def _move(copy: Copy, table: Table, axis: np.ndarray, angle: np.ndarray) -> None
     up = copy.body("static", "accelerometer").mean(axis=0)
     for sensor, change in (("accelerometer", turns @ up - up), ("gyroscope", rate[:, None] * axis)):
         back = np.linalg.inv(copy.truth[sensor].matrix)
-        put(table, COLUMNS[sensor], values(table, COLUMNS[sensor]) + change @ back.T)
+        add(table, sensor, change @ back.T)
 
 
 def leaked(copy: Copy, source: str, how: str) -> None:
@@ -237,16 +234,15 @@ def mapped(copy: Copy, axes: str) -> None:
 
 def shaken(copy: Copy, scope: str, size: float, hertz: float) -> None:
     """Let the bench vibrate at one frequency during some recordings."""
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         wave = np.sin(2.0 * np.pi * hertz * table[TIME] + copy.rng.uniform(0.0, 6.28))
         kick = size * copy.rng.standard_normal(3)
-        put(table, COLUMNS["accelerometer"], values(table, COLUMNS["accelerometer"]) + wave[:, None] * kick)
+        add(table, "accelerometer", wave[:, None] * kick)
 
 
 def warmer(copy: Copy, scope: str, degrees: float) -> None:
     """Let the temperature column of some recordings be that of a sensor elsewhere: so many degrees off."""
-    for name in copy.recordings(scope):
-        if TEMPERATURE in copy.tables[name]:
-            copy.tables[name][TEMPERATURE] = copy.tables[name][TEMPERATURE] + degrees
+    for table in copy.chosen(scope):
+        if TEMPERATURE in table:
+            table[TEMPERATURE] = table[TEMPERATURE] + degrees
     copy.harmless = copy.base != "hidden"

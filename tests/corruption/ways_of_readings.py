@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from good_bench import SENSORS
-from unit_copy import ANGLE, COLUMNS, RATE, TEMPERATURE, TIME, Copy, NotApplicableError, put, values
+from unit_copy import ANGLE, COLUMNS, RATE, TEMPERATURE, TIME, Copy, NotApplicableError, add, put, values
 
 SIZE = {"accelerometer": 1.0, "gyroscope": 100.0}  # g and deg/s: what a recording typically spans
 WHITE = {
@@ -39,8 +39,7 @@ def reordered(copy: Copy, scope: str, sensor: str, order: tuple[int, int, int]) 
 
 def exchanged_sensors(copy: Copy, scope: str) -> None:
     """Put the accelerometer's numbers into the gyroscope's columns and the other way round."""
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         accelerometer, gyroscope = (values(table, COLUMNS[s]) for s in SENSORS)
         put(table, COLUMNS["accelerometer"], gyroscope)
         put(table, COLUMNS["gyroscope"], accelerometer)
@@ -48,10 +47,9 @@ def exchanged_sensors(copy: Copy, scope: str) -> None:
 
 def offset(copy: Copy, scope: str, sensor: str, size: float) -> None:
     """Add a constant to all axes of some recordings: another bias there."""
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         added = size * SIZE[sensor] * copy.rng.choice([-1.0, 1.0], 3)
-        put(table, COLUMNS[sensor], values(table, COLUMNS[sensor]) + added)
+        add(table, sensor, added)
 
 
 def spiked(copy: Copy, scope: str, channel: str, size: float, rows: int = 1) -> None:
@@ -83,8 +81,7 @@ def stuck(copy: Copy, scope: str, channel: str, share: float = 1.0) -> None:
     """Let one column stay at a value, for a share of each recording."""
     column = _column(copy, channel)
     copy.said["column"] = column
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         if column not in table:
             continue
         n = len(table[column])
@@ -110,8 +107,7 @@ def stepped(copy: Copy, scope: str, channel: str, size: float) -> None:
 
 def knocked(copy: Copy, scope: str, size: float) -> None:
     """Knock at the bench: a decaying swing of a few samples in both sensors."""
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         n = len(table[TIME])
         first = int(copy.rng.integers(0, n - 10))
         copy.said["from_row"] = first
@@ -119,42 +115,39 @@ def knocked(copy: Copy, scope: str, size: float) -> None:
         swing = (later > 0) * np.exp(-later / 4.0) * np.cos(1.7 * later)
         for sensor in SENSORS:
             kick = size * SIZE[sensor] * copy.rng.standard_normal(3)
-            put(table, COLUMNS[sensor], values(table, COLUMNS[sensor]) + swing[:, None] * kick)
+            add(table, sensor, swing[:, None] * kick)
 
 
 def drifting(copy: Copy, scope: str, sensor: str, size: float) -> None:
     """Add a line in time to all axes of some recordings, from 0 to ``size``."""
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         line = np.linspace(0.0, size * SIZE[sensor], len(table[TIME]))
         added = line[:, None] * copy.rng.choice([-1.0, 1.0], 3)
-        put(table, COLUMNS[sensor], values(table, COLUMNS[sensor]) + added)
+        add(table, sensor, added)
     copy.causes |= {"bias_drift"}
 
 
 def noisy(copy: Copy, scope: str, sensor: str, factor: float, share: float = 1.0) -> None:
     """Add white noise of ``factor`` times the sensor's, to a share of each recording."""
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         n = len(table[TIME])
         length = int(share * n)
         first = int(copy.rng.integers(0, n - length + 1))
         inside = (np.arange(n) >= first) & (np.arange(n) < first + length)
         sigma = factor * WHITE[copy.model, sensor] * np.sqrt(0.12 / copy.interval_s)
         added = sigma * copy.rng.standard_normal((n, 3)) * inside[:, None]
-        put(table, COLUMNS[sensor], values(table, COLUMNS[sensor]) + added)
+        add(table, sensor, added)
 
 
 def coarse(copy: Copy, scope: str, sensor: str, step: float) -> None:
     """Round the readings: fewer bits than declared."""
-    for name in copy.recordings(scope):
-        put(copy.tables[name], COLUMNS[sensor], np.round(values(copy.tables[name], COLUMNS[sensor]) / step) * step)
+    for table in copy.chosen(scope):
+        put(table, COLUMNS[sensor], np.round(values(table, COLUMNS[sensor]) / step) * step)
 
 
 def clipped(copy: Copy, scope: str, sensor: str, at: float) -> None:
     """Clip the readings at a share of their largest: a smaller range than declared."""
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         readings = values(table, COLUMNS[sensor])
         top = at * float(np.abs(readings).max())
         put(table, COLUMNS[sensor], np.clip(readings, -top, top))
@@ -163,8 +156,7 @@ def clipped(copy: Copy, scope: str, sensor: str, at: float) -> None:
 def lagging(copy: Copy, scope: str, columns: str, tau: float) -> None:
     """Pass columns through a first-order low pass of time constant ``tau`` (s)."""
     wanted = {**COLUMNS, "rate": [RATE], "angle": [ANGLE], "table": [ANGLE, RATE]}[columns]
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         gain = 1.0 - np.exp(-np.diff(table[TIME], prepend=table[TIME][0]) / tau)
         for column in (c for c in wanted if c in table):
             out, state = np.empty(len(gain)), table[column][0]
@@ -198,7 +190,7 @@ def hidden_curve(copy: Copy, sensor: str, of: str, *, size: float, axes: int = 3
             waves = np.sin(np.outer(x[:, axis], frequency[axis]) + phase[axis]) - np.sin(phase[axis])
             curve[:, axis] = waves @ weight[axis]
         added = size * SIZE[sensor] * curve
-        put(table, COLUMNS[sensor], values(table, COLUMNS[sensor]) + added)
+        add(table, sensor, added)
     copy.causes |= {
         "force": {"quadratic_nonlinearity", "cubic_nonlinearity", "scale_factor_asymmetry", "cross_axis_nonlinearity"},
         "rate": {"quadratic_nonlinearity", "cubic_nonlinearity", "scale_factor_asymmetry", "rate_dependence"},

@@ -3,29 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from unit_copy import (
-    ANGLE,
-    ATTITUDE,
-    COLUMNS,
-    RATE,
-    TEMPERATURE,
-    TIME,
-    Copy,
-    NotApplicableError,
-    Table,
-    put,
-    rows_of,
-    values,
-)
+from unit_copy import ANGLE, ATTITUDE, RATE, TEMPERATURE, TIME, Copy, NotApplicableError, Table, put, rows_of, values
 
-SENSORS_COLUMNS = [*COLUMNS["accelerometer"], *COLUMNS["gyroscope"]]
 TABLE_COLUMNS = [ANGLE, RATE, *ATTITUDE]
 
 
 def column_scaled(copy: Copy, scope: str, column: str, factor: float, added: float = 0.0) -> None:
     """Replace a column by ``factor`` times it plus ``added``."""
-    for name in _with(copy, scope, column):
-        copy.tables[name][column] = factor * copy.tables[name][column] + added
+    for table in _with(copy, scope, column):
+        table[column] = factor * table[column] + added
 
 
 def gyroscope_and_rate_scaled(copy: Copy, scope: str, factor: float) -> None:
@@ -36,8 +22,7 @@ def gyroscope_and_rate_scaled(copy: Copy, scope: str, factor: float) -> None:
 
 def sense(copy: Copy, scope: str) -> None:
     """Count angle and rate the other way round."""
-    for name in _with(copy, scope, ANGLE):
-        table = copy.tables[name]
+    for table in _with(copy, scope, ANGLE):
         table[ANGLE], table[RATE] = -table[ANGLE], -table[RATE]
 
 
@@ -58,30 +43,27 @@ def face(copy: Copy, scope: str, degrees: float, *, backwards: bool = False) -> 
 
 def wrapped(copy: Copy, scope: str, *, symmetric: bool = False) -> None:
     """Log the angle from 0 to 360 deg, or from -180 to 180 deg."""
-    for name in _with(copy, scope, ANGLE):
-        table = copy.tables[name]
+    for table in _with(copy, scope, ANGLE):
         table[ANGLE] = np.mod(table[ANGLE] + 180.0, 360.0) - 180.0 if symmetric else np.mod(table[ANGLE], 360.0)
     copy.harmless = True
 
 
 def dropped_column(copy: Copy, scope: str, column: str) -> None:
     """Leave a column out."""
-    for name in _with(copy, scope, column):
+    for table in _with(copy, scope, column):
         for each in ATTITUDE if column == ATTITUDE[0] else [column]:
-            copy.tables[name].pop(each)
+            table.pop(each)
 
 
 def column_noise(copy: Copy, scope: str, column: str, sigma: float) -> None:
     """Add white noise to a column."""
-    for name in _with(copy, scope, column):
-        table = copy.tables[name]
+    for table in _with(copy, scope, column):
         table[column] = table[column] + sigma * copy.rng.standard_normal(len(table[column]))
 
 
 def column_rounded(copy: Copy, scope: str, column: str, step: float) -> None:
     """Round a column."""
-    for name in _with(copy, scope, column):
-        table = copy.tables[name]
+    for table in _with(copy, scope, column):
         table[column] = np.round(table[column] / step) * step
 
 
@@ -99,8 +81,7 @@ def column_of_another(copy: Copy, column: str) -> None:
 def shifted(copy: Copy, scope: str, rows: float, columns: str = "table") -> None:
     """Log the table's columns later than the sensor's by a number of rows (also a fraction), within the rows."""
     wanted = {"table": TABLE_COLUMNS, "rate": [RATE], "angle": [ANGLE]}[columns]
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         at = np.arange(len(table[TIME])) - rows
         for column in (c for c in wanted if c in table):
             table[column] = np.interp(at, np.arange(len(at)), table[column])
@@ -112,15 +93,14 @@ def shifted(copy: Copy, scope: str, rows: float, columns: str = "table") -> None
 
 def fast_clock(copy: Copy, scope: str, ppm: float) -> None:
     """Let the time column run fast against the table: the rates in it stay what they were."""
-    for name in copy.recordings(scope):
-        copy.tables[name][TIME] = copy.tables[name][TIME] * (1.0 + 1e-6 * ppm)
+    for table in copy.chosen(scope):
+        table[TIME] = table[TIME] * (1.0 + 1e-6 * ppm)
     copy.causes |= {"clock_rate"}
 
 
 def slow_table(copy: Copy, scope: str, ppm: float) -> None:
     """Let the table's log run slow against the sensor's rows."""
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         n = len(table[TIME])
         at = np.arange(n) * (1.0 - 1e-6 * ppm)
         for column in (c for c in (ANGLE, RATE) if c in table):
@@ -146,16 +126,14 @@ def slow_motion(copy: Copy, factor: float) -> None:
 
 def jitter(copy: Copy, scope: str, share: float) -> None:
     """Let the stamps scatter by a share of the interval."""
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         moved = table[TIME] + share * copy.interval_s * copy.rng.uniform(-1.0, 1.0, len(table[TIME]))
         table[TIME] = np.sort(moved)
 
 
 def time_reset(copy: Copy, scope: str) -> None:
     """Start the clock again at a random row."""
-    for name in copy.recordings(scope):
-        table = copy.tables[name]
+    for table in copy.chosen(scope):
         row = int(copy.rng.integers(len(table[TIME]) // 5, 4 * len(table[TIME]) // 5))
         copy.said["row"] = row
         table[TIME] = np.where(np.arange(len(table[TIME])) < row, table[TIME], table[TIME] - table[TIME][row])
@@ -170,8 +148,8 @@ def own_zeros(copy: Copy) -> None:
 
 def later(copy: Copy, scope: str, seconds: float) -> None:
     """Add a constant to the times of recordings."""
-    for name in copy.recordings(scope):
-        copy.tables[name][TIME] = copy.tables[name][TIME] + seconds
+    for table in copy.chosen(scope):
+        table[TIME] = table[TIME] + seconds
     copy.harmless = True
 
 
@@ -239,8 +217,7 @@ def attitude(copy: Copy, how: str, degrees: float = 0.0) -> None:
 
 def temperature(copy: Copy, scope: str, how: str) -> None:
     """Write the temperature in another unit, or that of something else."""
-    for name in _with(copy, scope, TEMPERATURE):
-        table = copy.tables[name]
+    for table in _with(copy, scope, TEMPERATURE):
         t = table[TEMPERATURE]
         table[TEMPERATURE] = {
             "kelvin": lambda t: t + 273.15,
@@ -275,9 +252,9 @@ def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:
     return np.concatenate([[np.cos(half)], np.sin(half) * axis])
 
 
-def _with(copy: Copy, scope: str, column: str) -> list[str]:
-    """Return those of the recordings that hold a column."""
-    found = [name for name in copy.recordings(scope) if column in copy.tables[name]]
+def _with(copy: Copy, scope: str, column: str) -> list[Table]:
+    """Return the tables of those recordings that hold a column."""
+    found = [table for table in copy.chosen(scope) if column in table]
     if not found:
         raise NotApplicableError(f"no {column} in {scope}")
     return found

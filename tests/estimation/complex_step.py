@@ -40,7 +40,6 @@ class Solved:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Residuals less parameters."""
         return len(self.residual) - len(self.x)
 
     @property
@@ -52,7 +51,6 @@ class Solved:
 
     @property
     def standard_uncertainty(self) -> np.ndarray[Any, Any]:
-        """Standard uncertainties of the parameters."""
         return np.sqrt(np.diag(self.covariance))
 
     @property

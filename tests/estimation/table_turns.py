@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.signal import lfilter
+from bench_session import gauss_markov
 from unit_settings import settings_of, with_noise
 
 from pipeline.core.records import Recording, SensorCalibration
@@ -41,18 +41,11 @@ def stepped_angle(step: float, dwell: float, stop: float = 360.0, start: float =
     return rests, np.where(moved, step / INTERVAL, 0.0)
 
 
-def ramped_rate(rates: list[float], turn_s: float = 6.0, rest_s: float = 5.0, ramp_s: float = 0.5) -> np.ndarray:
-    """Rest, ramp, steady turn, ramp, rest for each rate."""
-    ramp = np.linspace(0.0, 1.0, round(ramp_s / INTERVAL) + 1)
-    rest, turn = np.zeros(round(rest_s / INTERVAL)), np.ones(round(turn_s / INTERVAL))
+def ramped_rate(rates: list[float]) -> np.ndarray:
+    """Rest of 5 s, ramp of 0.5 s, steady turn of 6 s, ramp, rest for each rate."""
+    ramp = np.linspace(0.0, 1.0, round(0.5 / INTERVAL) + 1)
+    rest, turn = np.zeros(round(5.0 / INTERVAL)), np.ones(round(6.0 / INTERVAL))
     return np.concatenate([np.concatenate([rest, r * ramp, r * turn, r * ramp[::-1], rest]) for r in rates])
-
-
-def wander(rng: np.random.Generator, samples: int, size: float, time_constant: float) -> np.ndarray:
-    keep = np.exp(-INTERVAL / time_constant)
-    drive = size * np.sqrt(1.0 - keep**2) * rng.standard_normal((samples, 3))
-    drive[0] = size * rng.standard_normal(3)
-    return lfilter([1.0], [1.0, -keep], drive, axis=0)
 
 
 class Bench:
@@ -73,8 +66,7 @@ class Bench:
         self.sensor, self.bias, self.K, self.c = sensor, np.array(bias, float), np.array(K, float), np.array(c, float)
         self.white, self.gravity, self.clock = white, gravity, 0
         self.rng = np.random.default_rng(seed)
-        self.wander_size = wander_size
-        self._drift = wander(self.rng, 60_000, wander_size, 100.0) if wander_size else None
+        self._drift = wander_size * gauss_markov(self.rng, 60_000, INTERVAL / 100.0) if wander_size else None
 
     def reading(self, truth: np.ndarray) -> np.ndarray:
         clean = self.bias + truth @ self.K.T + self.c * np.abs(truth)
@@ -104,9 +96,9 @@ class Bench:
     def stop_and_go(self, step: float = 5.0, dwell: float = 1.2, axes: str = "xyz", **arc: float) -> list[Recording]:
         return [self.turn(axis, *stepped_angle(step, dwell, **arc)) for axis in axes]
 
-    def continuous(self, rate: float, axes: str = "xyz", stop: float = 360.0) -> list[Recording]:
+    def continuous(self, rate: float, stop: float = 360.0) -> list[Recording]:
         angle = np.arange(0.0, stop, rate * INTERVAL)
-        return [self.turn(axis, angle, np.full(len(angle), rate)) for axis in axes]
+        return [self.turn(axis, angle, np.full(len(angle), rate)) for axis in "xyz"]
 
     def turns_at(self, rates: dict[str, list[float]] | list[float]) -> list[Recording]:
         rates = rates if isinstance(rates, dict) else dict.fromkeys("xyz", rates)

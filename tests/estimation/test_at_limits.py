@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from ferraris_session import FITS
+from hand_session import METHODS
 from unit_settings import settings_of, with_noise
 
 from pipeline.app.one_unit import unit_of_recordings
@@ -37,7 +37,7 @@ def fitted(sensor: str, by: str, name: str = "", of: str = "", share: float = 0.
     settings = settings_of(sensor=SENSOR, table=unit.table, procedure=unit.procedure)
     recordings = with_noise(simulate_unit(unit, 7, 0)[0], settings)
     return (
-        FITS[sensor].fit(StageInput(sensor, recordings, None, settings))
+        METHODS[sensor].fit(StageInput(sensor, recordings, None, settings))
         if by != "table"
         else fit_on_table(StageInput(sensor, recordings, None, settings))
     )

@@ -19,9 +19,9 @@ INTERVAL_S = 0.01
 FILE = "log.csv"
 
 
-def readings(seed: int = 3) -> np.ndarray:
+def readings() -> np.ndarray:
     """Return time (s), specific force (g) and rate (deg/s) of rests and quarter turns about x: (3000, 7) array."""
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(3)
     time = INTERVAL_S * np.arange(SAMPLES)
     rate = np.where(np.arange(SAMPLES) % 500 >= 400, 90.0, 0.0)
     angle = np.radians(np.concatenate([[0.0], np.cumsum(rate[:-1]) * INTERVAL_S]))
@@ -74,8 +74,15 @@ class Case:
         return ingest
 
 
-def one(content: bytes, **expected: Any) -> Case:
-    return Case({FILE: content}, **expected)
+ALL = np.arange(SAMPLES)
+
+
+def refused(content: bytes, fault: str, says: str, *, line: int = 0, settings: dict[str, Any] | None = None) -> Case:
+    return Case({FILE: content}, fault, says, line, settings=settings or {})
+
+
+def read(content: bytes, *notes: str, kept: Any = ALL, **expected: Any) -> Case:
+    return Case({FILE: content}, notes=notes, kept=kept, **expected)
 
 
 # As git-lfs writes it (docs/spec.md of git-lfs, "The Pointer").
@@ -95,10 +102,11 @@ def changed(row: int, line: str) -> bytes:
     return text(rows)
 
 
-def cell(row: int, column: int, value: str) -> bytes:
-    cells = ROWS[row].split(",")
-    cells[column] = value
-    return changed(row, ",".join(cells))
+def cell(value: str) -> bytes:
+    """Return the log with another text for accel_y_g in the sixth row."""
+    cells = ROWS[5].split(",")
+    cells[2] = value
+    return changed(5, ",".join(cells))
 
 
 def table(values: np.ndarray, **columns: np.ndarray) -> bytes:
@@ -118,7 +126,6 @@ def two_logs() -> bytes:
     return text([f"{0.02 * (i // 2):.2f},{row.partition(',')[2]}" for i, row in enumerate(rows)])
 
 
-ALL = np.arange(SAMPLES)
 RATE = np.round(VALUES[:, 4])
 TABLE_ANGLE = np.concatenate([[0.0], np.cumsum(RATE[1:] + RATE[:-1]) / 2 * INTERVAL_S])
 DROP = {"csv/bad_rows": "drop"}
@@ -140,28 +147,18 @@ def indexed() -> dict[str, Any]:
     return {n: {"column": i, "unit": u} for i, (n, u) in enumerate(zip(names, units, strict=True))}
 
 
-def stuck(last: int = 1100) -> bytes:
+def edited(rows: slice, columns: int | slice, value: float | np.ndarray) -> bytes:
     values = VALUES.copy()
-    values[1000:last, 5] = values[1000, 5]
+    values[rows, columns] = value
     return text(rows_of(values))
 
 
-def clipped() -> bytes:
-    values = VALUES.copy()
-    values[420:424, 4] = 250.0
-    return text(rows_of(values))
+def stuck(last: int) -> bytes:
+    return edited(slice(1000, last), 5, VALUES[1000, 5])
 
 
 def scaled(columns: slice, factor: float) -> bytes:
-    values = VALUES.copy()
-    values[:, columns] *= factor
-    return text(rows_of(values))
-
-
-def reordered() -> list[str]:
-    rows = list(ROWS)
-    rows[700], rows[701] = rows[701], rows[700]
-    return rows
+    return edited(slice(None), columns, factor * VALUES[:, columns])
 
 
 def with_table_axis(order: tuple[int, int, int], sign: float = 1.0) -> bytes:
@@ -190,304 +187,237 @@ def table_log(offset_s: float, drift: float) -> bytes:
     return ("\n".join(["tau_s,angle_deg", *lines]) + "\n").encode()
 
 
-NEVER_DIES = 8
-
-
 def cases() -> dict[str, Case]:
-    """Return all cases, named by their number."""
     whole = text()
     micro = 2**32 - 12_345_678
     wrapping = [str((micro + 10_000 * i) % 2**32) for i in range(SAMPLES)]
+    sprinkled = text([r if i % 100 else "x" for i, r in enumerate(ROWS)])
+    nul_row = changed(5, "0.05" + "\0" * 64)
+    with_preamble, with_comment = b"Fs,100\nmode,0\n" + whole, b"# made by hand\n" + whole
+    header_again = text([*ROWS[:1500], HEADER, *ROWS[:1500]])
+    from_earlier = text([*ROWS[:1500], *ROWS[200:1000]])
+    rebooted = text([*ROWS[:1500], "rst cause:2", "boot", *ROWS[200:1000]])
+    decimal_commas = whole.replace(b",", b";").replace(b".", b",")
     unix = [f"{1.7e18 + 5000.0 * i:.17g}" for i in range(SAMPLES)]
     out = {
         "01": Case({}, "unreadable", "is a directory"),
         "01 missing": Case({}, "missing_file", "missing recordings: log"),
-        "02": one(b"", fault="empty", says=r"the file is empty \(0 bytes\)"),
-        "03": one(text([]), fault="no_rows", says="header on line 1, 0 data rows"),
-        "04 gzip": one(gzip.compress(whole), fault="foreign", says="a gzip file: decompress it first"),
-        "04 excel": one(b"PK\x03\x04" + whole, fault="foreign", says="a zip or Excel file"),
-        "04 mcap": one(b"\x89MCAP0\r\n", fault="foreign", says="give it the suffix .mcap"),
-        "04 sqlite": one(b"SQLite format 3\0" + whole, fault="foreign", says="give a ROS 2 bag the suffix .db3"),
+        "02": refused(b"", "empty", r"the file is empty \(0 bytes\)"),
+        "03": refused(text([]), "no_rows", "header on line 1, 0 data rows"),
+        "04 gzip": refused(gzip.compress(whole), "foreign", "a gzip file: decompress it first"),
+        "04 excel": refused(b"PK\x03\x04" + whole, "foreign", "a zip or Excel file"),
+        "04 mcap": refused(b"\x89MCAP0\r\n", "foreign", "give it the suffix .mcap"),
+        "04 sqlite": refused(b"SQLite format 3\0" + whole, "foreign", "give a ROS 2 bag the suffix .db3"),
         **{
             f"04 pointer{suffix}": Case(
                 {f"log{suffix}": LFS_POINTER}, fault="git_lfs", says="is a Git LFS pointer, .* run git lfs pull"
             )
             for suffix in (".csv", ".gcsv", ".mcap", ".bag", ".db3", ".ulg", ".bin", ".h5", ".mat")
         },
-        "05": one(b"\xef\xbb\xbf" + whole, notes=("N-BOM",), kept=ALL),
-        "06": one(text().decode().encode("utf-16"), fault="utf16", says="UTF-16 text: save it as UTF-8"),
-        "06 without mark": one(text().decode().encode("utf-16-le"), fault="utf16", says="UTF-16 text"),
-        "07 mixed": one(whole.replace(b"\n", b"\r\n", 40), notes=("N-EOL",), kept=ALL),
-        "07 CR": one(whole.replace(b"\n", b"\r"), notes=("N-EOL",), kept=ALL),
-        "07 inside a number": one(whole.replace(b"0.", b"0\r.", 1), fault="bad_row", says="a carriage return inside"),
-        "07 some lines": one(whole.replace(b"\n", b"\r", 40), notes=("N-EOL",), kept=ALL),
-        "07 CRLF": one(whole.replace(b"\n", b"\r\n"), notes=("N-EOL",), kept=ALL),
-        "08": one(whole[:-1], notes=("N-TAIL",), kept=without(SAMPLES - 1)),
-        "08 in a number": one(whole[:-5], notes=("N-TAIL",), kept=without(SAMPLES - 1)),
-        "09": one(changed(SAMPLES - 1, "29.99,0.1"), notes=("N-TAIL",), kept=without(SAMPLES - 1)),
-        "10 short": one(changed(5, "0.05,0.1"), fault="bad_row", says="has 2 fields where 7 are expected", line=7),
-        "10 many": one(
-            text([r if i % 100 else "x" for i, r in enumerate(ROWS)]),
-            fault="bad_row",
-            says=r"has 1 fields where 7 are expected: 'x' \(29 more such lines, up to line 2902: 102, 202, 302, 402 ",
+        "05": read(b"\xef\xbb\xbf" + whole, "N-BOM"),
+        "06": refused(text().decode().encode("utf-16"), "utf16", "UTF-16 text: save it as UTF-8"),
+        "06 without mark": refused(text().decode().encode("utf-16-le"), "utf16", "UTF-16 text"),
+        "07 mixed": read(whole.replace(b"\n", b"\r\n", 40), "N-EOL"),
+        "07 CR": read(whole.replace(b"\n", b"\r"), "N-EOL"),
+        "07 inside a number": refused(whole.replace(b"0.", b"0\r.", 1), "bad_row", "a carriage return inside"),
+        "07 some lines": read(whole.replace(b"\n", b"\r", 40), "N-EOL"),
+        "07 CRLF": read(whole.replace(b"\n", b"\r\n"), "N-EOL"),
+        "08": read(whole[:-1], "N-TAIL", kept=without(SAMPLES - 1)),
+        "08 in a number": read(whole[:-5], "N-TAIL", kept=without(SAMPLES - 1)),
+        "09": read(changed(SAMPLES - 1, "29.99,0.1"), "N-TAIL", kept=without(SAMPLES - 1)),
+        "10 short": refused(changed(5, "0.05,0.1"), "bad_row", "has 2 fields where 7 are expected", line=7),
+        "10 many": refused(
+            sprinkled,
+            "bad_row",
+            r"has 1 fields where 7 are expected: 'x' \(29 more such lines, up to line 2902: 102, 202, 302, 402 ",
             line=2,
         ),
-        "10 drop": one(
-            changed(5, "0.05,0.1"), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP, flags={5: 1}
+        "10 drop": read(changed(5, "0.05,0.1"), "N-BADROW", "N-GAP", kept=without(5), settings=DROP, flags={5: 1}),
+        "10 line break in a number": read(
+            changed(5, ROWS[5][:-2] + "\n" + ROWS[5][-2:]), "N-BADROW", "N-GAP", kept=without(5), settings=DROP
         ),
-        "10 line break in a number": one(
-            changed(5, ROWS[5][:-2] + "\n" + ROWS[5][-2:]), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP
-        ),
-        "10 over budget": one(
-            text([r if i % 100 else "x" for i, r in enumerate(ROWS)]),
-            fault="bad_row",
-            says="30 of 3000 rows would have to be repaired, more than the share of 0.001",
+        "10 over budget": refused(
+            sprinkled,
+            "bad_row",
+            "30 of 3000 rows would have to be repaired, more than the share of 0.001",
             line=2,
             settings=DROP,
         ),
-        "11": one(changed(5, ROWS[5] + ROWS[6]), fault="bad_row", says="has 13 fields where 7 are expected", line=7),
-        "11 drop": one(
-            text([*ROWS[:5], ROWS[5] + ROWS[6], *ROWS[7:]]),
-            notes=("N-BADROW", "N-GAP"),
-            kept=without(5, 6),
-            settings=DROP,
+        "11": refused(changed(5, ROWS[5] + ROWS[6]), "bad_row", "has 13 fields where 7 are expected", line=7),
+        "11 drop": read(
+            text([*ROWS[:5], ROWS[5] + ROWS[6], *ROWS[7:]]), "N-BADROW", "N-GAP", kept=without(5, 6), settings=DROP
         ),
-        "12": one(changed(5, "0.05" + "\0" * 64), fault="nul", says="64 NUL bytes, the first at byte", line=7),
-        "12 drop": one(changed(5, "0.05" + "\0" * 64), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP),
-        "13": one(whole + bytes(4096), notes=("N-NULTAIL",), kept=ALL),
-        "14": one(
-            b"Fs,100\nmode,0\n" + whole,
-            fault="missing_column",
-            says="line 3 holds them: set ingest.csv.skip_lines",
-            line=1,
-        ),
-        "14 profile": one(b"Fs,100\nmode,0\n" + whole, kept=ALL, settings={"csv/skip_lines": 2}),
+        "12": refused(nul_row, "nul", "64 NUL bytes, the first at byte", line=7),
+        "12 drop": read(nul_row, "N-BADROW", "N-GAP", kept=without(5), settings=DROP),
+        "13": read(whole + bytes(4096), "N-NULTAIL"),
+        "14": refused(with_preamble, "missing_column", "line 3 holds them: set ingest.csv.skip_lines", line=1),
+        "14 profile": read(with_preamble, settings={"csv/skip_lines": 2}),
         "14 gcsv": Case({"log.gcsv": gcsv()}, kept=ALL),
-        "15": one(b"# made by hand\n" + whole, fault="missing_column", says="found # made by hand", line=1),
-        "15 profile": one(b"# made by hand\n" + whole, notes=("N-COMMENT",), kept=ALL, settings={"csv/comment": "#"}),
-        "15 header": one(
-            b"# " + whole, notes=("N-COMMENT",), kept=ALL, settings={"csv/comment": "#", "csv/header": "commented"}
+        "15": refused(with_comment, "missing_column", "found # made by hand", line=1),
+        "15 profile": read(with_comment, "N-COMMENT", settings={"csv/comment": "#"}),
+        "15 header": read(b"# " + whole, "N-COMMENT", settings={"csv/comment": "#", "csv/header": "commented"}),
+        "16": refused(text(ROWS[1:], ROWS[0]), "no_header", "set ingest.csv.header=false", line=1),
+        "16 indexed": read(whole.partition(b"\n")[2], settings={"csv/header": False, "csv/columns": indexed()}),
+        "17": refused(header_again, "restarted", "by its key session", line=1502),
+        "17 session": read(header_again, "N-SESSION", kept=ALL[:1500], settings={"csv/session": 2}),
+        "18": refused(
+            whole.replace(b"gyro_y", b"gyro_x"), "duplicate_column", "gyro_x_dps occurs more than once", line=1
         ),
-        "16": one(text(ROWS[1:], ROWS[0]), fault="no_header", says="set ingest.csv.header=false", line=1),
-        "16 indexed": one(
-            whole.partition(b"\n")[2], kept=ALL, settings={"csv/header": False, "csv/columns": indexed()}
-        ),
-        "17": one(text([*ROWS[:1500], HEADER, *ROWS[:1500]]), fault="restarted", says="by its key session", line=1502),
-        "17 session": one(
-            text([*ROWS[:1500], HEADER, *ROWS[:1500]]),
-            notes=("N-SESSION",),
-            kept=ALL[:1500],
-            settings={"csv/session": 2},
-        ),
-        "18": one(
-            whole.replace(b"gyro_y", b"gyro_x"),
-            fault="duplicate_column",
-            says="gyro_x_dps occurs more than once",
-            line=1,
-        ),
-        "19": one(
-            whole.replace(b"gyro_z_dps", b"gyro_z_dsp"), fault="missing_column", says="nearest: gyro_z_dsp", line=1
-        ),
-        "19 ignored": one(table(VALUES, mag_x=RATE), notes=("N-IGNORED",), kept=ALL),
-        "20": one(
+        "19": refused(whole.replace(b"gyro_z_dps", b"gyro_z_dsp"), "missing_column", "nearest: gyro_z_dsp", line=1),
+        "19 ignored": read(table(VALUES, mag_x=RATE), "N-IGNORED"),
+        "20": read(
             text(
                 [",".join(r.split(",")[i] for i in (6, 5, 4, 3, 2, 1, 0)) for r in ROWS],
                 ",".join(HEADER.split(",")[::-1]),
             ),
-            notes=("N-ORDER",),
-            kept=ALL,
+            "N-ORDER",
         ),
-        "21": one(
-            whole.replace(b",", b";").replace(b".", b","),
-            fault="decimal_comma",
-            says="a decimal comma",
-            line=2,
-            settings={"csv/delimiter": ";"},
-        ),
-        "21 profile": one(
-            whole.replace(b",", b";").replace(b".", b","), kept=ALL, settings={"csv/delimiter": ";", "csv/decimal": ","}
-        ),
-        "22": one(whole.replace(b",", b";"), fault="missing_column", says="is the separator ';'", line=1),
-        "22 auto": one(whole.replace(b",", b"\t"), notes=("N-DELIM",), kept=ALL, settings={"csv/delimiter": "auto"}),
-        "23": one(cell(5, 2, "ERR"), fault="not_a_number", says=r"column accel_y_g \(accel_y\) is 'ERR'", line=7),
-        "23 drop": one(cell(5, 2, "ERR"), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP),
-        "24 empty": one(cell(5, 2, ""), fault="not_finite", says=r"accel_y_g \(accel_y\) is empty", line=7),
-        "24 NaN": one(cell(5, 2, "NaN"), fault="not_finite", says="is 'NaN'; a finite number is expected", line=7),
-        "24 infinite": one(cell(5, 2, "-inf"), fault="not_finite", says="is '-inf'; a finite number", line=7),
-        "24 too large": one(cell(5, 2, "1e400"), fault="not_finite", says="more than a number can hold", line=7),
-        "24 gap": one(cell(5, 2, "NaN"), notes=("N-NAN", "N-GAP"), kept=without(5), settings={"csv/nan": "gap"}),
-        "25 hexadecimal": one(cell(5, 2, "0x1F"), fault="not_a_number", says="is '0x1F'", line=7),
-        "25 thousands": one(cell(5, 2, '"1,000.5"'), fault="not_a_number", says="is '1,000.5'", line=7),
-        "25 quotes": one(cell(5, 2, '"0.5"'), fault="not_a_number", says="is '\"0.5\"', in quotes", line=7),
-        "25 minus": one(cell(5, 2, "\u22120.5"), fault="not_a_number", says="is '\u22120.5'", line=7),
-        "26": one(
+        "21": refused(decimal_commas, "decimal_comma", "a decimal comma", line=2, settings={"csv/delimiter": ";"}),
+        "21 profile": read(decimal_commas, settings={"csv/delimiter": ";", "csv/decimal": ","}),
+        "22": refused(whole.replace(b",", b";"), "missing_column", "is the separator ';'", line=1),
+        "22 auto": read(whole.replace(b",", b"\t"), "N-DELIM", settings={"csv/delimiter": "auto"}),
+        "23": refused(cell("ERR"), "not_a_number", r"column accel_y_g \(accel_y\) is 'ERR'", line=7),
+        "23 drop": read(cell("ERR"), "N-BADROW", "N-GAP", kept=without(5), settings=DROP),
+        "24 empty": refused(cell(""), "not_finite", r"accel_y_g \(accel_y\) is empty", line=7),
+        "24 NaN": refused(cell("NaN"), "not_finite", "is 'NaN'; a finite number is expected", line=7),
+        "24 infinite": refused(cell("-inf"), "not_finite", "is '-inf'; a finite number", line=7),
+        "24 too large": refused(cell("1e400"), "not_finite", "more than a number can hold", line=7),
+        "24 gap": read(cell("NaN"), "N-NAN", "N-GAP", kept=without(5), settings={"csv/nan": "gap"}),
+        "25 hexadecimal": refused(cell("0x1F"), "not_a_number", "is '0x1F'", line=7),
+        "25 thousands": refused(cell('"1,000.5"'), "not_a_number", "is '1,000.5'", line=7),
+        "25 quotes": refused(cell('"0.5"'), "not_a_number", "is '\"0.5\"', in quotes", line=7),
+        "25 minus": refused(cell("\u22120.5"), "not_a_number", "is '\u22120.5'", line=7),
+        "26": refused(
             whole,
-            fault="bad_configuration",
-            says="accel_x.unit is None; allowed are g",
+            "bad_configuration",
+            "accel_x.unit is None; allowed are g",
             settings={"csv/columns/accel_x/unit": None},
         ),
-        "26 unknown": one(
-            whole, fault="bad_configuration", says="unit is 'm/s2'", settings={"csv/columns/accel_x/unit": "m/s2"}
+        "26 unknown": refused(
+            whole, "bad_configuration", "unit is 'm/s2'", settings={"csv/columns/accel_x/unit": "m/s2"}
         ),
-        "27": one(
+        "27": refused(
             whole.replace(b"accel_x_g", b"ax [m/s^2]"),
-            fault="unit_contradiction",
+            "unit_contradiction",
+            r"'ax \[m/s\^2\]' is in m/s\^2, ingest.csv.columns.accel_x.unit says g",
             line=1,
-            says=r"'ax \[m/s\^2\]' is in m/s\^2, ingest.csv.columns.accel_x.unit says g",
             settings={"csv/columns/accel_x/column": "ax [m/s^2]"},
         ),
-        "28 counts": one(scaled(slice(1, 4), 16384.0), fault="implausible_force", says="look like raw counts"),
-        "28 m/s^2": one(scaled(slice(1, 4), 9.80665), fault="implausible_force", says=r"look like m/s\^2"),
-        "28 rad/s": one(
-            scaled(slice(4, 7), np.pi / 180),
-            fault="implausible_rate",
-            says="look like rad/s that were declared as deg/s",
+        "28 counts": refused(scaled(slice(1, 4), 16384.0), "implausible_force", "look like raw counts"),
+        "28 m/s^2": refused(scaled(slice(1, 4), 9.80665), "implausible_force", r"look like m/s\^2"),
+        "28 rad/s": refused(
+            scaled(slice(4, 7), np.pi / 180), "implausible_rate", "look like rad/s that were declared as deg/s"
         ),
-        "28 full-scale range": one(
+        "28 full-scale range": refused(
             scaled(slice(4, 7), 0.5),
-            fault="implausible_rate",
-            says="multiplied by 2 .* another full-scale range than declared, or the times are wrong",
+            "implausible_rate",
+            "multiplied by 2 .* another full-scale range than declared, or the times are wrong",
         ),
-        "28 rad/s by the table": one(
+        "28 rad/s by the table": refused(
             table(np.column_stack([VALUES[:, :4], VALUES[:, 4:] * np.pi / 180]), table_rate_dps=RATE),
-            fault="implausible_rate",
-            says="look like rad/s that were declared as deg/s",
+            "implausible_rate",
+            "look like rad/s that were declared as deg/s",
         ),
-        "28 full scale": one(
-            scaled(slice(4, 7), 57.3), fault="beyond_full_scale", says="beyond 1.2 times the full scale"
-        ),
-        "29": one(whole.replace(b"time_s,", b"t,"), fault="missing_column", says="column time_s", line=1),
-        "29 rate": one(
+        "28 full scale": refused(scaled(slice(4, 7), 57.3), "beyond_full_scale", "beyond 1.2 times the full scale"),
+        "29": refused(whole.replace(b"time_s,", b"t,"), "missing_column", "column time_s", line=1),
+        "29 rate": read(whole, "N-IGNORED", "N-SYNTHTIME", settings={"csv/columns/time": None, "csv/rate_hz": 100.0}),
+        "30": refused(
             whole,
-            notes=("N-IGNORED", "N-SYNTHTIME"),
-            kept=ALL,
-            settings={"csv/columns/time": None, "csv/rate_hz": 100.0},
-        ),
-        "30": one(
-            whole,
-            fault="wrong_rate",
-            says="the median interval is 10 us, .* expects 10000 us; .* a thousand times longer",
+            "wrong_rate",
+            "the median interval is 10 us, .* expects 10000 us; .* a thousand times longer",
             settings={"csv/columns/time/unit": "ms", "checks/rate_hz": 100.0},
         ),
-        "31": one(times(unix), fault="coarse_time", says="256 ns apart", settings={"csv/columns/time/unit": "ns"}),
-        "32": one(times(wrapping), notes=("N-WRAP",), kept=ALL, settings={"csv/columns/time/unit": "us"}),
-        "32 milliseconds": one(
+        "31": refused(times(unix), "coarse_time", "256 ns apart", settings={"csv/columns/time/unit": "ns"}),
+        "32": read(times(wrapping), "N-WRAP", settings={"csv/columns/time/unit": "us"}),
+        "32 milliseconds": read(
             times([str((2**32 - 12_345 + 10 * i) % 2**32) for i in range(SAMPLES)]),
-            notes=("N-WRAP",),
-            kept=ALL,
+            "N-WRAP",
             settings={"csv/columns/time/unit": "ms"},
         ),
-        "32 of 16 bits": one(
+        "32 of 16 bits": read(
             times([str((2**16 - 500 + i) % 2**16) for i in range(SAMPLES)]),
-            notes=("N-WRAP",),
-            kept=ALL,
+            "N-WRAP",
             settings={"csv/columns/time": {"column": "time_s", "unit": "counts", "counts_per_unit": 100.0}},
         ),
-        "33": one(
-            text([*ROWS[:1500], *ROWS[200:1000]]),
-            fault="time_back",
-            says="time goes back to 2 s after 14.99 s",
+        "33": refused(from_earlier, "time_back", "time goes back to 2 s after 14.99 s", line=1502),
+        "33 part of it twice": refused(
+            from_earlier,
+            "time_back",
+            "lines 1502 to 2301 repeat lines 202 to 1001 exactly: delete them; the log has 2 parts, lines 2 to 15",
             line=1502,
         ),
-        "33 part of it twice": one(
-            text([*ROWS[:1500], *ROWS[200:1000]]),
-            fault="time_back",
-            says="lines 1502 to 2301 repeat lines 202 to 1001 exactly: delete them; the log has 2 parts, lines 2 to 15",
+        "33 a block twice": read(text([*ROWS[:1500], *ROWS[1480:]]), "N-REPEAT"),
+        "33 a block three times": read(text([*ROWS[:1500], *ROWS[1480:1500], *ROWS[1480:]]), "N-REPEAT", "N-REPEAT"),
+        "33 a block twice that differs": refused(
+            text([*ROWS[:1500], *ROWS[1480:1499], ROWS[1499] + "9", *ROWS[1500:]]), "time_back", "goes back"
+        ),
+        "33 session": read(from_earlier, "N-SESSION", kept=ALL[200:1000], settings={"csv/session": 2}),
+        "10 and a restart": refused(
+            rebooted,
+            "bad_row",
+            "1 more such lines.*Also line 1504: time goes back.*2 parts, lines 2 to 1501; 1504 to 2303",
             line=1502,
         ),
-        "33 a block twice": one(text([*ROWS[:1500], *ROWS[1480:]]), notes=("N-REPEAT",), kept=ALL),
-        "33 a block three times": one(
-            text([*ROWS[:1500], *ROWS[1480:1500], *ROWS[1480:]]), notes=("N-REPEAT", "N-REPEAT"), kept=ALL
+        "33 session and text": read(rebooted, "N-SESSION", kept=ALL[200:1000], settings={"csv/session": 2}),
+        "34": read(text([*ROWS[:700], ROWS[701], ROWS[700], *ROWS[702:]]), "N-SORT", flags={700: 8, 701: 8}),
+        "35 same": read(text([*ROWS[:10], *ROWS[9:]]), "N-DUP"),
+        "35 different": refused(
+            text([*ROWS[:10], ROWS[9][:-1] + "9", *ROWS[10:]]), "duplicate_time", "time repeats 0.09 s", line=12
         ),
-        "33 a block twice that differs": one(
-            text([*ROWS[:1500], *ROWS[1480:1499], ROWS[1499] + "9", *ROWS[1500:]]), fault="time_back", says="goes back"
+        "36": read(text([*ROWS[:600], *ROWS[610:]]), "N-GAP", kept=without(*range(600, 610)), flags={600: 1}),
+        "36 too long": refused(
+            text([*ROWS[:600], *ROWS[700:]]), "missing_time", "3.334% of the time is missing", line=602
         ),
-        "33 session": one(
-            text([*ROWS[:1500], *ROWS[200:1000]]), notes=("N-SESSION",), kept=ALL[200:1000], settings={"csv/session": 2}
-        ),
-        "10 and a restart": one(
-            text([*ROWS[:1500], "rst cause:2", "boot", *ROWS[200:1000]]),
-            fault="bad_row",
-            says="1 more such lines.*Also line 1504: time goes back.*2 parts, lines 2 to 1501; 1504 to 2303",
-            line=1502,
-        ),
-        "33 session and text": one(
-            text([*ROWS[:1500], "rst cause:2", "boot", *ROWS[200:1000]]),
-            notes=("N-SESSION",),
-            kept=ALL[200:1000],
-            settings={"csv/session": 2},
-        ),
-        "34": one(text(reordered()), notes=("N-SORT",), kept=ALL, flags={700: NEVER_DIES, 701: NEVER_DIES}),
-        "35 same": one(text([*ROWS[:10], *ROWS[9:]]), notes=("N-DUP",), kept=ALL),
-        "35 different": one(
-            text([*ROWS[:10], ROWS[9][:-1] + "9", *ROWS[10:]]),
-            fault="duplicate_time",
-            says="time repeats 0.09 s",
-            line=12,
-        ),
-        "36": one(text([*ROWS[:600], *ROWS[610:]]), notes=("N-GAP",), kept=without(*range(600, 610)), flags={600: 1}),
-        "36 too long": one(
-            text([*ROWS[:600], *ROWS[700:]]), fault="missing_time", says="3.334% of the time is missing", line=602
-        ),
-        "36 bursts": one(
+        "36 bursts": refused(
             times([f"{0.08 * (i // 8) + 0.0002 * (i % 8):.4f}" for i in range(SAMPLES)]),
-            fault="bursts",
-            says=r"bursts of 8, 80 ms apart, with times 0.2 ms apart: .* ingest.csv.columns.time=null and "
+            "bursts",
+            r"bursts of 8, 80 ms apart, with times 0.2 ms apart: .* ingest.csv.columns.time=null and "
             r"ingest.csv.rate_hz=100,",
             line=10,
         ),
-        "36 burst lost": one(
+        "36 burst lost": refused(
             text([f"{0.08 * (i // 8):.2f},{r.partition(',')[2]}" for i, r in enumerate(ROWS) if i // 8 != 100]),
-            fault="bursts",
-            says=r"bursts of 8, 80 ms apart: they depart from a regular clock .* as if rows were missing; if no row is "
+            "bursts",
+            r"bursts of 8, 80 ms apart: they depart from a regular clock .* as if rows were missing; if no row is "
             r"missing, count the rows: ingest.csv.columns.time=null and ingest.csv.rate_hz=100,",
             line=10,
         ),
-        "36 rounded": one(
+        "36 rounded": refused(
             times([f"{int(i / 0.833) / 1000:.3f}" for i in range(SAMPLES)]),
-            fault="missing_time",
-            says=r"16.694% of the time is missing; the times are multiples of 1 ms; if they are rounded and no row is "
+            "missing_time",
+            r"16.694% of the time is missing; the times are multiples of 1 ms; if they are rounded and no row is "
             r"missing, count the rows: .*ingest.csv.rate_hz=833.056",
         ),
-        "35 bursts": one(times([f"{0.08 * (i // 8):.2f}" for i in range(SAMPLES)]), notes=("N-BURSTS",), kept=ALL),
-        "35 two logs": one(
-            two_logs(),
-            fault="bursts",
-            says="their rows differ as those of two sensors or of two merged logs do",
-            line=4,
+        "35 bursts": read(times([f"{0.08 * (i // 8):.2f}" for i in range(SAMPLES)]), "N-BURSTS"),
+        "35 two logs": refused(
+            two_logs(), "bursts", "their rows differ as those of two sensors or of two merged logs do", line=4
         ),
-        "37": one(
-            times([f"{0.01 * i + 0.004 * ((i * 7) % 3 == 0):.3f}" for i in range(SAMPLES)]),
-            notes=("N-JITTER",),
-            kept=ALL,
+        "37": read(times([f"{0.01 * i + 0.004 * ((i * 7) % 3 == 0):.3f}" for i in range(SAMPLES)]), "N-JITTER"),
+        "37 too much": read(times([f"{0.01 * i + 0.008 * (i % 2):.3f}" for i in range(SAMPLES)]), "N-JITTER"),
+        "38": read(stuck(1100), "N-STUCK", kept=None, flags={1000: 4, 1099: 4}),
+        "38 half": refused(stuck(2900), "stuck", "gyro_y stays at one value .* in 1900 of 3000 rows"),
+        "38 dead": refused(scaled(slice(6, 7), 0.0), "stuck", "gyro_z is 0 deg/s in all 3000 rows"),
+        "39": read(edited(slice(420, 424), 4, 250.0), "N-CLIP", kept=None, flags={420: 2, 423: 2}),
+        "40 axis": refused(
+            with_table_axis((2, 0, 1)), "wrong_axis", "said to turn about x, and the gyroscope turns about y"
         ),
-        "37 too much": one(
-            times([f"{0.01 * i + 0.008 * (i % 2):.3f}" for i in range(SAMPLES)]), notes=("N-JITTER",), kept=ALL
-        ),
-        "38": one(stuck(), notes=("N-STUCK",), flags={1000: 4, 1099: 4}),
-        "38 half": one(stuck(2900), fault="stuck", says="gyro_y stays at one value .* in 1900 of 3000 rows"),
-        "38 dead": one(scaled(slice(6, 7), 0.0), fault="stuck", says="gyro_z is 0 deg/s in all 3000 rows"),
-        "39": one(clipped(), notes=("N-CLIP",), flags={420: 2, 423: 2}),
-        "40 axis": one(
-            with_table_axis((2, 0, 1)), fault="wrong_axis", says="said to turn about x, and the gyroscope turns about y"
-        ),
-        "40 sign": one(with_table_axis((0, 1, 2), -1.0), fault="wrong_sense", says="sign opposite to the table's rate"),
-        "40 sense": one(with_angle(-TABLE_ANGLE, -RATE), notes=("N-FOUND",), kept=ALL),
-        "45": one(
+        "40 sign": refused(with_table_axis((0, 1, 2), -1.0), "wrong_sense", "sign opposite to the table's rate"),
+        "40 sense": read(with_angle(-TABLE_ANGLE, -RATE), "N-FOUND"),
+        "45": refused(
             with_angle(TABLE_ANGLE + 180.0, RATE),
-            fault="wrong_face",
-            says=r"mounted otherwise than stated, .*set procedure\.recordings\.log\.up=-z",
+            "wrong_face",
+            r"mounted otherwise than stated, .*set procedure\.recordings\.log\.up=-z",
         ),
-        "46": one(with_angle(TABLE_ANGLE + 37.0, RATE), notes=("N-FOUND",), kept=ALL),
-        "47": one(
+        "46": read(with_angle(TABLE_ANGLE + 37.0, RATE), "N-FOUND"),
+        "47": refused(
             with_angle(TABLE_ANGLE, RATE, mirrored="y"),
-            fault="mirrored_axes",
-            says=r"gravity turns as in a turn about body -x, and the gyroscope reads a turn about \+x",
+            "mirrored_axes",
+            r"gravity turns as in a turn about body -x, and the gyroscope reads a turn about \+x",
         ),
-        "48": one(
+        "48": refused(
             with_angle(TABLE_ANGLE, RATE, upright=True),
-            fault="wrong_face",
-            says=r"the turn axis is vertical, and \+z is stated to point up; .*procedure\.recordings\.log\.up=\+x",
+            "wrong_face",
+            r"the turn axis is vertical, and \+z is stated to point up; .*procedure\.recordings\.log\.up=\+x",
         ),
         "41": Case(
             {FILE: whole, "table.csv": table_log(5.25, 40e-6)},
@@ -519,7 +449,7 @@ def cases() -> dict[str, Case]:
             "no_sync",
             "does not show the motion that the gyroscope read",
         ),
-        "43": one(whole, fault="changed", says="the file changed while it was read"),
+        "43": refused(whole, "changed", "the file changed while it was read"),
         "44": Case(
             {FILE: whole, "other.csv": whole}, "same_file", "recordings log and other are the same file, byte for byte"
         ),

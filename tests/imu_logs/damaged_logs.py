@@ -95,22 +95,12 @@ def same_bits(one: Log, other: Log) -> bool:
 
 @dataclass
 class Tally:
-    """How often a damaged file was refused, read right, or read wrong in silence.
+    """How often a damaged file was refused, read right, or read wrong in silence."""
 
-    Attributes
-    ----------
-    ours, oracle : Counter
-        ``refused``, ``unaffected`` and ``wrong`` of our reader and of the official one.
-    beside : Counter
-        The two together.
-    strange : list of str
-        Exceptions other than the ingest error.
-    """
-
-    ours: Counter[str] = field(default_factory=Counter)
-    oracle: Counter[str] = field(default_factory=Counter)
-    beside: Counter[tuple[str, str]] = field(default_factory=Counter)
-    strange: list[str] = field(default_factory=list)
+    ours: Counter[str] = field(default_factory=Counter)  # ``refused``, ``unaffected`` or ``wrong``
+    oracle: Counter[str] = field(default_factory=Counter)  # the same, of the official reader
+    beside: Counter[tuple[str, str]] = field(default_factory=Counter)  # the two together
+    strange: list[str] = field(default_factory=list)  # exceptions other than the ingest error
 
     def take(self, damaged: bytes, truth: Log, messages: Messages) -> None:
         """Read a damaged file with both."""

@@ -95,10 +95,10 @@ def write_raw_ulog(path: Path, truth: Truth, messages: dict[str, tuple[str, NDAr
     return path
 
 
-def write_dataflash(path: Path, truth: Truth, instances: int = 2, warmth: str = "f") -> Path:
+def write_dataflash(path: Path, truth: Truth, warmth: str = "f") -> Path:
     """Write a DataFlash log with the formats, units and multipliers that ArduPilot 4 writes, by pymavlink.
 
-    ``warmth``: format of the temperature; ``c``: in whole hundredths.
+    It has two sensors. ``warmth``: format of the temperature; ``c``: in whole hundredths.
     """
     log = DFReader_binary.__new__(DFReader_binary)
     log.formats = {0x80: DFFormat(0x80, "FMT", 89, "BBnNZ", "Type,Length,Name,Format,Columns")}
@@ -115,7 +115,7 @@ def write_dataflash(path: Path, truth: Truth, instances: int = 2, warmth: str = 
     out += [log.make_msgbuf(known["MULT"], [0, ord("F"), 1e-6]), log.make_msgbuf(known["MULT"], [0, ord("0"), 1.0])]
     out.append(log.make_msgbuf(known["FMTU"], [0, 180, b"s#EEEooo--O--zz", b"F-000000-00--00"[:15]]))
     for us, rate, force, warm in zip(truth.time_us.tolist(), truth.rate, truth.force, truth.warmth, strict=True):
-        for i in range(instances):
+        for i in range(2):
             stored = round(100 * warm) if warmth == "c" else warm
             values = [us, i, *rate, *(force + i), 0, 0, stored, 1, 1, 1000, 1000]
             out.append(log.make_msgbuf(known["IMU"], values))
@@ -123,14 +123,14 @@ def write_dataflash(path: Path, truth: Truth, instances: int = 2, warmth: str = 
     return path
 
 
-def write_arrays(path: Path, truth: Truth, place: str = "imu", units: tuple[str, str] = ("m/s^2", "rad/s")) -> Path:
-    """Write an HDF5 file, or a MATLAB file of version 5 (``.mat``), with t, acc and gyr in a group."""
+def write_arrays(path: Path, truth: Truth, units: tuple[str, str] = ("m/s^2", "rad/s")) -> Path:
+    """Write an HDF5 file, or a MATLAB file of version 5 (``.mat``), with t, acc and gyr in the group imu."""
     arrays: dict[str, NDArray[Any]] = {"t": truth.time_us / 1e6, "acc": truth.force, "gyr": truth.rate}
     if path.suffix == ".mat":
-        savemat(path, {place: arrays, "fs": 100.0})
+        savemat(path, {"imu": arrays, "fs": 100.0})
         return path
     with h5py.File(path, "w") as file:
-        group = file.create_group(place)
+        group = file.create_group("imu")
         for name, array in arrays.items():
             group[name] = array
         group["acc"].attrs["units"], group["gyr"].attrs["units"] = units
@@ -138,10 +138,10 @@ def write_arrays(path: Path, truth: Truth, place: str = "imu", units: tuple[str,
     return path
 
 
-def write_matlab73(path: Path, truth: Truth, place: str = "imu") -> Path:
+def write_matlab73(path: Path, truth: Truth) -> Path:
     """Write an HDF5 file as MATLAB 7.3 does: a text of 512 bytes first, arrays transposed."""
     with h5py.File(path, "w", userblock_size=512) as file:
-        group = file.create_group(place)
+        group = file.create_group("imu")
         for name, array in {"t": (truth.time_us / 1e6)[None], "acc": truth.force.T, "gyr": truth.rate.T}.items():
             group[name] = array
     with path.open("r+b") as stream:

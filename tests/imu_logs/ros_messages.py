@@ -14,18 +14,7 @@ if TYPE_CHECKING:
 
     from rosbags.typesys.store import Typestore
 
-NUMPY = {
-    "int8": np.int8,
-    "uint8": np.uint8,
-    "int16": np.int16,
-    "uint16": np.uint16,
-    "int32": np.int32,
-    "uint32": np.uint32,
-    "int64": np.int64,
-    "uint64": np.uint64,
-    "float32": np.float32,
-    "float64": np.float64,
-}
+NUMBERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
 NAME = "lab_msgs/msg/Sample"
 INNER = "lab_msgs/msg/Inner"
 FIRST_NS = 1_700_000_000_123_456_789
@@ -42,23 +31,13 @@ class RandomField:
 
 @dataclass(frozen=True)
 class RandomLog:
-    """A log of random messages.
+    """A log of random messages."""
 
-    Attributes
-    ----------
-    before, between, inner : tuple of RandomField
-        Fields around the three that are read, and those of a type within.
-    wanted : tuple of str
-        Types of the three fields that are read.
-    alike : bool
-        Whether texts and sequences have the same lengths in all messages.
-    """
-
-    before: tuple[RandomField, ...]
-    between: tuple[RandomField, ...]
-    inner: tuple[RandomField, ...]
-    wanted: tuple[str, ...]
-    alike: bool
+    before: tuple[RandomField, ...]  # fields before the three that are read
+    between: tuple[RandomField, ...]  # after the first of them
+    inner: tuple[RandomField, ...]  # of a type within
+    wanted: tuple[str, ...]  # types of the three fields that are read
+    alike: bool  # whether texts and sequences have the same lengths in all messages
     messages: int
     seed: int
     chunk_size: int
@@ -140,8 +119,8 @@ def value_of(
     values: np.random.Generator,
 ) -> Any:
     count = int(lengths.integers(0, 4)) if item.count == -1 else item.count
-    if item.kind in NUMPY:
-        code = np.dtype(NUMPY[item.kind])
+    if item.kind in NUMBERS:
+        code = np.dtype(item.kind)
         if code.kind == "f":
             numbers = values.normal(size=max(1, count)).astype(code)
         else:

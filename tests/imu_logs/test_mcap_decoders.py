@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap_ros1.decoder import DecoderFactory as Ros1Factory
 from mcap_ros2.decoder import DecoderFactory as Ros2Factory
-from ros_messages import FIRST_NS, INNER, NAME, NUMPY, STEP_NS, RandomField, RandomLog
+from ros_messages import FIRST_NS, INNER, NAME, NUMBERS, STEP_NS, RandomField, RandomLog
 from rosbags.typesys import Stores, get_typestore
 from unit_settings import ingest_of
 
@@ -32,14 +32,14 @@ MAP = {
 }
 INNER_NAME = INNER.replace("/msg/", "/")
 counts = st.sampled_from([0, 0, 1, 3, -1])
-plain = st.builds(RandomField, st.sampled_from([*NUMPY, "string"]), counts)
+plain = st.builds(RandomField, st.sampled_from([*NUMBERS, "string"]), counts)
 any_field = st.one_of(plain, st.builds(RandomField, st.just(INNER_NAME), counts))
 logs = st.builds(
     RandomLog,
     before=st.lists(any_field, max_size=4).map(tuple),
     between=st.lists(any_field, max_size=3).map(tuple),
     inner=st.lists(plain, min_size=1, max_size=3).map(tuple),
-    wanted=st.lists(st.sampled_from(list(NUMPY)), min_size=3, max_size=3).map(tuple),
+    wanted=st.lists(st.sampled_from(NUMBERS), min_size=3, max_size=3).map(tuple),
     alike=st.booleans(),
     messages=st.integers(2, 9),
     seed=st.integers(0, 2**20),

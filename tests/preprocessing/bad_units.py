@@ -168,7 +168,6 @@ class Case:
 
 
 def cases() -> dict[str, Case]:
-    """Return all cases, named by their number."""
     rate, angle = "table_rate", "table_angle"
     scale, wrong = "reference_scale", "reference_contradiction"
     gyro_radians = of("gyroscope", times(RADIAN))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import unit_settings
+from bench_session import BIAS, K
 from scipy.spatial.transform import Rotation
 
 from pipeline.checks.bench import signed_axis
@@ -14,11 +15,6 @@ from pipeline.core.records import Recording
 from pipeline.core.settings import RecordingFile, Settings
 
 INTERVAL_S = 0.12
-BIAS = {"accelerometer": np.array([0.03, -0.02, 0.05]), "gyroscope": np.array([1.2, -0.8, 0.5])}
-K = {
-    "accelerometer": np.array([[1.01, 0.004, -0.006], [0.002, 0.99, 0.005], [-0.003, 0.007, 1.02]]),
-    "gyroscope": np.array([[0.99, 0.006, -0.002], [-0.004, 1.015, 0.003], [0.005, -0.001, 1.004]]),
-}
 USUAL_UP = {"x": "+z", "y": "+z", "z": "+x"}
 # Rests at 24 angles for the accelerometer, turns both ways between rests for the gyroscope.
 STEPS = np.repeat(np.arange(0.0, 361.0, 15.0), 12)
@@ -27,22 +23,15 @@ RATE = np.concatenate([np.zeros(40), *[np.append(np.full(50, r), np.zeros(20)) f
 
 @dataclass(frozen=True)
 class Setup:
-    """How a turn is mounted: what points up where the table shows ``zero``, and which way the angle counts.
-
-    Attributes
-    ----------
-    seat : (3,) array, deg
-        Rotation of the unit in its seat, body frame.
-    """
+    """How a turn is mounted: what points up where the table shows ``zero``, and which way the angle counts."""
 
     axis: str
     up: str = ""
     sense: int = 1
     zero: float = 0.0
-    seat: Any = (0.0, 0.0, 0.0)
+    seat: Any = (0.0, 0.0, 0.0)  # (3,), deg: rotation of the unit in its seat, body frame
 
     def recording(self, role: str, seed: int = 0, noise: float = 1.0) -> Recording:
-        """Return the turn as it is logged."""
         turned = STEPS if role == "accelerometer" else np.cumsum(RATE) * INTERVAL_S
         rate = np.zeros_like(STEPS) if role == "accelerometer" else RATE
         axis, up = signed_axis(f"+{self.axis}"), signed_axis(self.up or USUAL_UP[self.axis])

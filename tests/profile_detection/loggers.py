@@ -33,31 +33,17 @@ def motion() -> np.ndarray:
 
 @dataclass(frozen=True)
 class Logger:
-    """How one kind of logger writes.
+    """How one kind of logger writes."""
 
-    Attributes
-    ----------
-    header : str
-        Empty where it writes none.
-    scales : tuple of float
-        What a second, a g and a deg/s are written as; 0 for no time.
-    expected : dict
-        What a proposal has to say: of ``csv``, and of channels their column, unit and scale.
-    order : str
-        Groups of columns: t, a and g.
-    reverse : bool
-        Axes in the order z, y, x.
-    """
-
-    header: str
-    scales: tuple[float, float, float]
-    expected: dict
+    header: str  # empty where it writes none
+    scales: tuple[float, float, float]  # what a second, a g and a deg/s are written as; 0 for no time
+    expected: dict  # of a proposal: ``csv``, and of channels their column, unit and scale
     before: str = ""
     delimiter: str = ","
     decimal: str = "."
-    order: str = "tag"
+    order: str = "tag"  # groups of columns: t, a and g
     whole: bool = False
-    reverse: bool = False
+    reverse: bool = False  # axes in the order z, y, x
     offset: float = 0.0
     start: float = 0.0
     name: str = "log.csv"

@@ -54,6 +54,19 @@ def sensor_truth(sensor: str) -> SensorCalibration:
     )
 
 
+def readings_of(
+    force: np.ndarray, rate: np.ndarray, rng: np.random.Generator, effect: float = 0.0
+) -> dict[str, np.ndarray]:
+    """Return what the sensors read; ``effect``: of the accelerometer, g/g^2."""
+    readings = {}
+    for sensor, values in (("accelerometer", force), ("gyroscope", rate)):
+        known = sensor_truth(sensor)
+        squared = effect * values**2 if sensor == "accelerometer" else 0.0
+        noise = SIGMA[sensor] * rng.standard_normal(values.shape)
+        readings[sensor] = known.bias + values @ np.linalg.solve(known.matrix, np.eye(3)).T + squared + noise
+    return readings
+
+
 def turn(name: str, role: str, axis: str, samples: int, start: float, *, rng: np.random.Generator) -> Recording:
     time = start + 0.12 * np.arange(samples)
     angle = np.linspace(0.0, 360.0, samples)
@@ -69,13 +82,7 @@ def turn(name: str, role: str, axis: str, samples: int, start: float, *, rng: np
         source={"file": f"raw/U1/{name}.csv", "sha256": "ab" * 32, "rows": samples},
     )
     motion = reference_motion(bare)
-    readings = {}
-    for sensor, values in (("accelerometer", motion.specific_force), ("gyroscope", motion.angular_rate)):
-        known = sensor_truth(sensor)
-        readings[sensor] = known.bias + values @ np.linalg.solve(known.matrix, np.eye(3)).T
-        if sensor == "accelerometer":
-            readings[sensor] = readings[sensor] + EFFECT * values**2
-        readings[sensor] = readings[sensor] + SIGMA[sensor] * rng.standard_normal((samples, 3))
+    readings = readings_of(motion.specific_force, motion.angular_rate, rng, EFFECT)
     return replace(bare, **readings, notes=(Note("N-GAP", 2, 40, 90, "2 gaps of 0.24 s"),))
 
 
@@ -84,11 +91,7 @@ def held_out(samples: int, rng: np.random.Generator) -> Recording:
     direction = rng.standard_normal((samples, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     rate = 40.0 * np.abs(np.sin(time / 30.0))
-    readings = {}
-    for sensor, values in (("accelerometer", direction), ("gyroscope", rate[:, None] * direction[::-1])):
-        known = sensor_truth(sensor)
-        readings[sensor] = known.bias + values @ np.linalg.solve(known.matrix, np.eye(3)).T
-        readings[sensor] = readings[sensor] + SIGMA[sensor] * rng.standard_normal((samples, 3))
+    readings = readings_of(direction, rate[:, None] * direction[::-1], rng)
     return Recording(
         "validation", "validation", None, np.rint(time * 1e9).astype(np.int64), **readings, table_rate=rate
     )
@@ -111,6 +114,15 @@ def steps(values: dict[str, float]) -> list[dict[str, Any]]:
     ]
 
 
+def ranked(
+    effect: str, parameters: dict[str, Any], figures: tuple[float, ...], alike: str = "", *, plausible: bool = True
+) -> dict[str, Any]:
+    names = ("delta_bic", "p_value", "explained_share", "held_out_error_before", "held_out_error_after")
+    look_alikes = [{"effect": alike, "share": 0.94}] if alike else []
+    entry = {"effect": effect, "parameters": parameters, "look_alikes": look_alikes, "plausible": plausible}
+    return entry | dict(zip(names, figures, strict=True))
+
+
 def diagnosis_of(sensor: str) -> dict[str, Any]:
     if sensor == "gyroscope":
         return {
@@ -123,45 +135,17 @@ def diagnosis_of(sensor: str) -> dict[str, Any]:
             "next_experiment": "",
             "override": "",
         }
-    coefficient = {"value": EFFECT, "unit": "g/g^2", "expanded_uncertainty": 0.00005}
+    k2 = {f"k2_{a}": {"value": EFFECT, "unit": "g/g^2", "expanded_uncertainty": 0.00005} for a in "xyz"}
+    c = {f"c_{a}": {"value": 0.0052, "unit": "", "expanded_uncertainty": 1e-4} for a in "xyz"}
+    b = {"b_x": {"value": 0.0001, "unit": "g/degC", "expanded_uncertainty": 1e-4}}
     return {
         "verdict": "missing_effect",
         "residual_over_noise": 1.41,
         "selected": ["quadratic_nonlinearity"],
         "ranking": [
-            {
-                "effect": "quadratic_nonlinearity",
-                "delta_bic": 2184.2,
-                "p_value": 0.0,
-                "parameters": {f"k2_{a}": coefficient for a in "xyz"},
-                "explained_share": 0.98,
-                "held_out_error_before": 0.0042,
-                "held_out_error_after": 0.0031,
-                "look_alikes": [{"effect": "scale_factor_asymmetry", "share": 0.94}],
-                "plausible": True,
-            },
-            {
-                "effect": "scale_factor_asymmetry",
-                "delta_bic": 1710.0,
-                "p_value": 1e-30,
-                "parameters": {f"c_{a}": {"value": 0.0052, "unit": "", "expanded_uncertainty": 1e-4} for a in "xyz"},
-                "explained_share": 0.91,
-                "held_out_error_before": 0.0042,
-                "held_out_error_after": 0.0033,
-                "look_alikes": [{"effect": "quadratic_nonlinearity", "share": 0.94}],
-                "plausible": True,
-            },
-            {
-                "effect": "bias_temperature",
-                "delta_bic": 3.1,
-                "p_value": 0.02,
-                "parameters": {"b_x": {"value": 0.0001, "unit": "g/degC", "expanded_uncertainty": 1e-4}},
-                "explained_share": 0.01,
-                "held_out_error_before": 0.0042,
-                "held_out_error_after": 0.0042,
-                "look_alikes": [],
-                "plausible": False,
-            },
+            ranked("quadratic_nonlinearity", k2, (2184.2, 0.0, 0.98, 0.0042, 0.0031), "scale_factor_asymmetry"),
+            ranked("scale_factor_asymmetry", c, (1710.0, 1e-30, 0.91, 0.0042, 0.0033), "quadratic_nonlinearity"),
+            ranked("bias_temperature", b, (3.1, 0.02, 0.01, 0.0042, 0.0042), plausible=False),
         ],
         "not_observable": [{"effect": "lever_arm", "reason": "the table turned too slowly"}],
         "unexplained": [{"covariate": "temperature", "p_value": 0.001}],

@@ -27,6 +27,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_research.figures import wilson
+from imu_research.study.run import read_lines
 from pipeline.app.one_unit import ConfiguredUnit, unit_of_recordings
 from pipeline.core.errors import PipelineError
 from pipeline.core.records import SENSORS, NotCalibrated, coverage_factor
@@ -68,12 +69,12 @@ def drawn(
             seats[name] = size * rng.uniform(0.0, 1.0) * direction / np.linalg.norm(direction)
     leans = coverage and kind == "single"  # as the table states; seats contain it
     bench: dict[str, Any] = {
-        "direction_deg": np.zeros((3, 2)).tolist() if KINDS[kind] == "single" and not leans else None,
         "rate_error": [0.0, 0.0, 0.0],  # encoders keep the angle over any number of turns; see ``judged``
         "mounting_deg": {n: (face * Rotation.from_rotvec(s, degrees=True)).as_rotvec(degrees=True).tolist()
                          for n, s in seats.items()},
     }  # fmt: skip
-    bench = {key: value for key, value in bench.items() if value is not None}
+    if KINDS[kind] == "single" and not leans:
+        bench["direction_deg"] = np.zeros((3, 2)).tolist()
     if "remounted" in kind:
         bench |= {
             "sense": int(rng.choice([-1, 1])),
@@ -261,11 +262,10 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=list(KINDS))
     parser.add_argument("--hidden", type=float, default=0.4, help="share of units with a hidden effect")
     parser.add_argument("--coverage", choices=["sheet", "drawn"], default="")
-    parser.add_argument("--out", required=True)
+    parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     hidden = 0.0 if options.coverage else options.hidden
-    file = Path(options.out)
-    lines = [json.loads(text) for text in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
+    lines = read_lines(options.out)
     known = {(line["kind"], line["seed"], line["number"]) for line in lines}
     for place in range(options.units):
         number, kind = place // len(options.kinds), options.kinds[place % len(options.kinds)]
@@ -274,7 +274,7 @@ def main() -> None:
         if (kind, options.seed, number) in known:
             continue
         lines.append(judged(kind, options.seed, number, hidden, options.coverage))
-        with file.open("a", encoding="utf-8") as stream:
+        with options.out.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(lines[-1]) + "\n")
     sys.stdout.write(table(lines))
 

@@ -17,6 +17,7 @@ import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.signal import lfilter
 
 from pipeline.app.guide import fitted_by_hand, progress_of, propose
 from pipeline.core.records import Recording, coverage_factor
@@ -64,10 +65,8 @@ class Unit:
             force = np.concatenate([move + shake, force])
         keep = np.exp(-1 / RATE_HZ / SHEET.wander_time_s)
         steps = SHEET.bias_wander * np.sqrt(1 - keep**2) * self.rng.standard_normal(force.shape)
-        wander = np.empty_like(force)
-        for i, step in enumerate(steps):
-            self.wander = keep * self.wander + step
-            wander[i] = self.wander
+        wander, _ = lfilter([1.0], [1.0, -keep], steps, axis=0, zi=keep * self.wander[None])
+        self.wander = wander[-1]
         white = SHEET.noise_density * np.sqrt(RATE_HZ / 2) * self.rng.standard_normal(force.shape)
         reading = self.bias + force @ self.gain.T + wander + white
         self.log.append(np.round(reading * SHEET.counts_per_unit) / SHEET.counts_per_unit)
@@ -82,7 +81,6 @@ class Unit:
         return float(np.count_nonzero(np.abs(error) <= coverage_factor(progress.freedom) * u))
 
     def recording(self) -> Recording:
-        """Return the log so far."""
         force = np.concatenate(self.log)
         time = np.round(np.arange(len(force)) / RATE_HZ * 1e9).astype(np.int64)
         return Recording("recording", "rests", None, time, accelerometer=force)

@@ -37,7 +37,6 @@ TAU_S = 100.0
 LIMITS = {"accelerometer": (0.08, 0.03, 0.02), "gyroscope": (20.0, 0.03, 0.02)}
 BETWEEN = 0.01  # deg/s, of the gyroscope's bias between files
 CONTAINED = {"bias_temperature", "bias_temperature_quadratic"}  # in bias_temperature_cubic, whose third power may hide
-COLUMNS = "time_s,accel_x_g,accel_y_g,accel_z_g,gyro_x_dps,gyro_y_dps,gyro_z_dps"
 
 
 if TYPE_CHECKING:
@@ -91,25 +90,21 @@ class Unit:
         between: float = BETWEEN,
     ) -> None:
         """Record a file; ``warmth``: (n,), degC, a further column."""
-        start = 0.0
-        time = start + np.arange(len(rate)) / hz
-        readings = []
+        header, columns = "time_s", [np.arange(len(rate)) / hz]
         if "a" in sensors:
-            readings.append(self.read("accelerometer", force, np.zeros(3), hz))
+            header += ",accel_x_g,accel_y_g,accel_z_g"
+            columns.append(self.read("accelerometer", force, np.zeros(3), hz))
         if "g" in sensors:
-            readings.append(self.read("gyroscope", rate, between * self.rng.normal(size=3), hz))
-        names = COLUMNS.split(",")
-        used = [0, *([1, 2, 3] if "a" in sensors else []), *([4, 5, 6] if "g" in sensors else [])]
-        header = ",".join(names[i] for i in used)
+            header += ",gyro_x_dps,gyro_y_dps,gyro_z_dps"
+            columns.append(self.read("gyroscope", rate, between * self.rng.normal(size=3), hz))
         if warmth is not None:
             header += ",temperature_degc"
-            readings.append(warmth[:, None] + 0.02 * self.rng.normal(size=(len(warmth), 1)))
-        table = np.column_stack([time, *readings])
+            columns.append(warmth[:, None] + 0.02 * self.rng.normal(size=(len(warmth), 1)))
+        table = np.column_stack(columns)
         np.savetxt(self.folder / f"{name}.csv", table, fmt="%.9g", delimiter=",", header=header, comments="")
         self.rows.append(f"{name}.csv,{row}")
 
     def sheet(self) -> None:
-        """Write the sheet."""
         (self.folder / "recordings.csv").write_text("\n".join(self.rows) + "\n")
 
 
@@ -169,10 +164,10 @@ def turns(unit: Unit, sensors: str) -> None:
             unit.write(f"turn_{axis}_{k}", f"turn,{axis},{shown},{accuracy:.3g},", *joined(*parts), sensors)
 
 
-def on_table(unit: Unit, sensors: str, axis: int, logged: str, off_deg: float = 0.1) -> None:
+def on_table(unit: Unit, sensors: str, axis: int, logged: str) -> None:
     """Steps by 45 deg about a body axis, with rests, and back at once, on a table that logs ``angle`` or ``rate``."""
     e, up = np.eye(3)[axis], np.eye(3)[0 if axis == 2 else 2]
-    e = e + np.radians(off_deg) * unit.rng.normal(size=3) * (np.arange(3) != axis)
+    e = e + np.radians(0.1) * unit.rng.normal(size=3) * (np.arange(3) != axis)
     e /= np.linalg.norm(e)
     parts, angles, reached = [at_rest(4.0, up)], [np.zeros(round(4.0 * RATE_HZ))], 0.0
     for step in (*[45.0] * 7, -315.0):
@@ -221,7 +216,7 @@ def attitudes(unit: Unit) -> None:
 def slow(unit: Unit) -> None:
     """Slow movement through all attitudes for one to four minutes, with accelerations of 2 to 20 mg."""
     rng, n = unit.rng, round(unit.rng.uniform(60.0, 240.0) * RATE_HZ)
-    time, force = np.arange(n) / RATE_HZ, np.empty((n, 3))
+    time = np.arange(n) / RATE_HZ
     swings = [sum(rng.uniform(0.5, 1.0) * np.sin(2.0 * np.pi * rng.uniform(0.02, 0.06) * time + p) for p in phase)
               for phase in rng.uniform(0.0, 2.0 * np.pi, (2, 3))]  # fmt: skip
     around, above = np.pi * swings[0], 1.2 * swings[1]
@@ -333,8 +328,7 @@ def main(argv: list[str]) -> int:
             for kind in kinds
             for figure in told(kind, pool.map(partial(run, kind=kind, **options), range(arguments.units)))
         ]
-    if arguments.figures:
-        write_figures(arguments.figures, figures)
+    write_figures(arguments.figures, figures)
     return 0
 
 

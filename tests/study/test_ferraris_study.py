@@ -15,8 +15,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from ferraris_session import FITS, held_out, in_parts, simulated
+from ferraris_session import held_out, in_parts, simulated
 from scipy import stats
+
+from pipeline.core.records import SENSORS
 
 SEED, UNITS = 1995, 100
 LEVEL = 0.95
@@ -29,8 +31,8 @@ LEAST, LEAST_OF_ONE = (
 @cache
 def covered(layout: str) -> dict[str, np.ndarray]:
     """Return whether each error is within its expanded uncertainty, by sensor: (units, 12) arrays."""
-    found: dict[str, list[np.ndarray]] = {sensor: [] for sensor in FITS}
-    sizes: dict[str, list[np.ndarray]] = {sensor: [] for sensor in FITS}
+    found: dict[str, list[np.ndarray]] = {sensor: [] for sensor in SENSORS}
+    sizes: dict[str, list[np.ndarray]] = {sensor: [] for sensor in SENSORS}
     for k in range(UNITS):
         session = {"whole": held_out, "parts": in_parts}[layout](simulated(SEED + k))
         for sensor, own in found.items():
@@ -48,7 +50,7 @@ def covered(layout: str) -> dict[str, np.ndarray]:
 
 @pytest.mark.study
 @pytest.mark.parametrize("layout", ["whole", "parts"])
-@pytest.mark.parametrize("sensor", list(FITS))
+@pytest.mark.parametrize("sensor", SENSORS)
 def test_stated_uncertainties_cover_the_errors(layout: str, sensor: str) -> None:
     share = covered(layout)[sensor].mean(axis=0)
     assert share.mean() >= LEAST

@@ -22,11 +22,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from hand_session import fitted
 from hand_simulator import Drawn, Hand, draw, draw_together, one_sensor
 from scipy import stats
 from unit_settings import settings_of, with_noise
 
-from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.core.records import SENSORS
 from pipeline.estimation.effects import model_of
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.multi_position.selection import SelectionByHand
@@ -48,7 +49,6 @@ CASES: dict[str, tuple[Hand, int]] = {  # and how many of each
     "shared": (Hand(settle_deg=0.3), 40),
     "bursts": (Hand(jitter=0.3), 40),
 }
-FITS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
 ALONE = 5  # every fifth log holds the accelerometer alone
 TOGETHER = 3  # units of one log
 LOW, HIGH = 0.85, 1.15  # mean squared error over its variance, of every matrix element
@@ -63,11 +63,10 @@ HIDDEN = {  # sensor, effect, half of its limit in the sensor file, and length o
 def judged(drawn: Drawn) -> dict[str, Any]:
     """Return z^2 of each parameter, by sensor, and whether the held-out error is as expected."""
     found = {}
-    for sensor, method in FITS.items():
+    for sensor in SENSORS:
         if drawn.recording.reading(sensor) is None:
             continue
-        task = StageInput(sensor, with_noise([drawn.recording], drawn.settings), None, drawn.settings)
-        calibration = method.fit(task)
+        calibration = fitted(sensor, [drawn.recording], drawn.settings)
         assert calibration.covariance is not None
         assert calibration.freedom is not None
         u = np.sqrt(np.diag(calibration.covariance))[:12]
@@ -106,7 +105,7 @@ def in_one_log(hand: Hand, seed: int, folder: Path) -> list[Drawn]:
 
 def mean_squares(case: str, found: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
     """Return what was judged by sensor, and print its means."""
-    by_sensor = {sensor: [one[sensor] for one in found if sensor in one] for sensor in FITS}
+    by_sensor = {sensor: [one[sensor] for one in found if sensor in one] for sensor in SENSORS}
     for sensor, ones in by_sensor.items():
         chi = np.mean([one["chi"] for one in ones], axis=0)
         inside = np.mean([one["inside"] for one in ones])
@@ -130,7 +129,7 @@ def test_held_out_errors_and_uncertainties_of_500_recordings(tmp_path: Path) -> 
     found = {case: study(case, count) for case, (_, count) in CASES.items()}
     logs = [in_one_log(CASES["all"][0], 20_000 + k, tmp_path / str(k)) for k in range(14)]
     found["one log"] = mean_squares("one log", [judged(drawn) for units in logs for drawn in units])
-    for sensor in FITS:
+    for sensor in SENSORS:
         ones = [one for case in found.values() for one in case[sensor]]
         assert np.mean([one["inside"] for one in ones]) >= 0.98
         squares = np.array([one["chi"] for one in ones])[:, 3:]
@@ -148,7 +147,7 @@ def named(which: str, seed: int, rest_s: float | None = None) -> bool:
     drawn = draw(Hand(rests=20, rest_s=rest_s or length, effects={which: size * signs}), 30_000 + seed)
     settings = settings_of(drawn.settings, procedure={"holdout_every": 0})
     noise = estimate_noise(sensor, [drawn.recording], settings.sensor.of(sensor))
-    calibration = FITS[sensor].fit(StageInput(sensor, with_noise([drawn.recording], settings), None, settings))
+    calibration = fitted(sensor, [drawn.recording], settings)
     model = model_of([drawn.recording], calibration, noise, settings)
     assert model is not None
     return effect in SelectionByHand(model, calibration, [], noise, settings.sensor.of(sensor)).names

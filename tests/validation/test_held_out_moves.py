@@ -7,15 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hand_session import fitted
 from hand_simulator import Hand, draw
-from unit_settings import with_noise
 
 from pipeline.app.one_unit import unit_of_recordings
 from pipeline.core.records import SENSORS, MovesError
-from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
-from pipeline.estimation.stages import StageInput
 from pipeline.evaluation.held_out.attitude import gravity_direction
 from pipeline.evaluation.held_out.validation import validate
 from tests.published import diagnose
@@ -24,8 +21,7 @@ from tests.published import diagnose
 def test_held_out_moves_beyond_noise_and_uncertainty_are_unexplained() -> None:
     drawn = draw(Hand(), 3)
     settings, good = drawn.settings, drawn.recording
-    modules = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
-    fits = [m.fit(StageInput(s, with_noise([good], settings), None, settings)) for s, m in modules.items()]
+    fits = [fitted(sensor, [good], settings) for sensor in SENSORS]
     noise = estimate_noise("gyroscope", [good], settings.sensor.gyroscope)
     assert good.gyroscope is not None
     # Rates read 5 % too large while the unit turns: in the held-out moves alone, as the fit is that of the good ones.

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ferraris_session import FITS
+from hand_session import METHODS
 from unit_settings import settings_of, with_noise
 
 from pipeline.core.records import BIAS, base_values
@@ -26,7 +26,7 @@ def test_the_bias_is_within_an_uncertainty_that_holds_the_rounding(sensor: str, 
     recordings, truth = simulate_unit(unit, seed, 0)
     coarse = [replace(r, **{sensor: step * np.round(r.reading(sensor) / step)}) for r in recordings]
     with_noises = with_noise(coarse, SETTINGS)
-    found = with_stated(FITS[sensor].fit(StageInput(sensor, with_noises, None, SETTINGS)), with_noises, SETTINGS)
+    found = with_stated(METHODS[sensor].fit(StageInput(sensor, with_noises, None, SETTINGS)), with_noises, SETTINGS)
     U = found.parameters.expanded_uncertainty[BIAS]
     error = base_values(found.bias, found.matrix)[BIAS] - truth[sensor]["bias"]
     assert np.all(np.abs(error) < 2.0 * U)

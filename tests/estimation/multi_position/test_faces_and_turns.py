@@ -41,14 +41,14 @@ def without(session: Session, start_s: float, stop_s: float) -> Session:
 @pytest.mark.parametrize("sensor", ["accelerometer", "gyroscope"])
 def test_both_matrices_are_full_and_within_their_uncertainty(whole: Session, sensor: str) -> None:
     error, u, freedom = whole.errors(sensor)
-    assert not whole.fit(sensor).stages[-1].details.departures
+    assert not whole.calibrated(sensor).stages[-1].details.departures
     assert np.all(u > 0.0)
     assert np.all(np.abs(error) < stats.t.ppf(1.0 - 1e-3 / 24, freedom) * u)
 
 
 def test_stages_after_the_faces_and_the_diagnosis_know_the_method_that_fitted_them(whole: Session) -> None:
     """The result ``faces`` of nonlinear_least_squares is no stage of a method: it has no declaration."""
-    faces = whole.fit("accelerometer")
+    faces = whole.calibrated("accelerometer")
     assert [stage.name for stage in faces.stages] == ["nonlinear_least_squares", "faces"]
     assert last_fit(faces).free
     settings = settings_of(whole.settings, effects={"accelerometer": ["quadratic_nonlinearity"]})
@@ -67,7 +67,7 @@ def test_a_face_is_known_to_the_hand_and_the_length_of_gravity_to_the_noise(whol
 def test_turns_alone_give_scale_and_direction_to_the_stated_accuracy() -> None:
     turns = PROCEDURE.turns
     session = in_parts(simulated(3))
-    found = session.fit("gyroscope")
+    found = session.calibrated("gyroscope")
     _, u, _ = session.errors("gyroscope")
     assert np.all(u[[3, 7, 11]] < 1.3 * turns.accuracy_deg / 360.0)
     assert np.all(u[OFF_DIAGONAL] < 1.3 * np.radians(turns.axis_accuracy_deg))
@@ -87,7 +87,7 @@ def test_an_accurate_stop_gives_an_accurate_scale() -> None:
 def test_a_hand_that_departs_from_what_is_stated_is_doubted() -> None:
     stated = {"turns": {"accuracy_deg": 0.3}, "faces": {"accuracy_deg": 0.1}}
     session = simulated(8, procedure=stated)
-    found = {sensor: session.fit(sensor) for sensor in ("accelerometer", "gyroscope")}
+    found = {sensor: session.calibrated(sensor) for sensor in ("accelerometer", "gyroscope")}
     told = {sensor: fit.stages[-1].details.departures for sensor, fit in found.items()}
     assert any("times procedure.faces.accuracy_deg" in text for text in told["accelerometer"])
     assert any("times procedure.turns.accuracy_deg" in text for text in told["gyroscope"])
@@ -109,7 +109,7 @@ def test_every_second_turn_is_held_out_and_judged(whole: Session) -> None:
     roles = [r.role for r in whole.recordings]
     assert roles.count("validation") == 3
     assert all(r.start_s is None or r.detail.endswith("found") for part in whole.recordings for r in part.notes)
-    fits = {sensor: whole.fit(sensor) for sensor in ("accelerometer", "gyroscope")}
+    fits = {sensor: whole.calibrated(sensor) for sensor in ("accelerometer", "gyroscope")}
     noise = estimate_noise("gyroscope", whole.recordings, whole.settings.sensor.gyroscope)
     found = gravity_direction(
         fits["accelerometer"], fits["gyroscope"], whole.recordings, noise, whole.settings.procedure
@@ -142,9 +142,9 @@ def test_rests_of_2_s_are_found_and_around_those_of_4_s_a_turn_is_held_out(
 
 def test_a_rotation_of_the_case_changes_both_frames_and_no_move(whole: Session) -> None:
     """The moves tell nothing of the common frame: else the gyroscope would claim to know it better than the faces."""
-    gyroscope = whole.fit("gyroscope")
+    gyroscope = whole.calibrated("gyroscope")
     noise = noise_of("gyroscope", whole.recordings, whole.settings.sensor.gyroscope)
-    model = model_of(whole.recordings, gyroscope, noise, whole.settings.procedure, whole.fit("accelerometer"))
+    model = model_of(whole.recordings, gyroscope, noise, whole.settings.procedure, whole.calibrated("accelerometer"))
     assert model is not None
     moves = model.equations_of_moves(State(gyroscope.bias, gyroscope.matrix))
     for x in range(3):
@@ -159,7 +159,7 @@ def test_a_rotation_of_the_case_changes_both_frames_and_no_move(whole: Session) 
 def test_a_part_with_too_few_moves_is_fitted_by_its_rests_and_turns_alone(whole: Session) -> None:
     """Cross-validation leaves out every third rest with the move before it: few moves may be left."""
     noise = noise_of("gyroscope", whole.recordings, whole.settings.sensor.gyroscope)
-    model = model_of(whole.recordings, None, noise, whole.settings.procedure, whole.fit("accelerometer"))
+    model = model_of(whole.recordings, None, noise, whole.settings.procedure, whole.calibrated("accelerometer"))
     assert model is not None
     assert model.moves is not None
     used = np.arange(model.moves.count) < MIN_MOVES
@@ -185,7 +185,7 @@ def test_a_missing_face_is_named() -> None:
     down = first.accelerometer[:, 1] < -0.8
     gone = replace(session, recordings=[first.select(~down), *session.recordings[1:]])
     with pytest.raises(NotObservableError, match=r"no rest with body -y up, within 15 deg: .*Nearest to up"):
-        gone.fit("accelerometer")
+        gone.calibrated("accelerometer")
 
 
 def test_a_missing_turn_is_named_with_the_largest_about_its_axis() -> None:
@@ -195,13 +195,13 @@ def test_a_missing_turn_is_named_with_the_largest_about_its_axis() -> None:
     fast = np.flatnonzero(np.abs(first.gyroscope[:, 2]) > 90.0)
     cut = without(session, *(first.time[[fast[0] - 50, len(first.time) - 1]] - first.time[0]))
     with pytest.raises(CannotCalibrateError, match=r"no turn about z by a multiple of 360 deg.* the largest about z"):
-        cut.fit("gyroscope")
+        cut.calibrated("gyroscope")
 
 
 def test_an_implausible_angle_is_named_in_whole_and_in_parts() -> None:
     stated = {"turns": {"angle_deg": 500.0}}
     session = simulated(7, procedure=stated)
     with pytest.raises(CannotCalibrateError, match=r"no turn about x by a multiple of 500 deg.*is \((-)?3\d\d\.\d, "):
-        session.fit("gyroscope")
+        session.calibrated("gyroscope")
     with pytest.raises(CannotCalibrateError, match=r"recording x_rot is no turn about x by a multiple of 500 deg"):
-        in_parts(session).fit("gyroscope")
+        in_parts(session).calibrated("gyroscope")

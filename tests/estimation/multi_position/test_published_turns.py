@@ -8,26 +8,21 @@ uncertainty.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
-from unit_settings import settings_of, with_noise
+from hand_session import fitted
+from unit_settings import settings_of
 
+from pipeline.core.records import SENSORS, Recording, SensorCalibration
 from pipeline.core.settings import Window
-from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.estimation.stages import StageInput
 from pipeline.ingest.read import read_recordings
 from pipeline.physics.signal.segments import cut
 from pipeline.simulation.description import shipped_settings
 
-if TYPE_CHECKING:
-    from pipeline.core.records import Recording, SensorCalibration
-
 DATA = Path(__file__).parents[4] / "shared" / "data" / "ferraris_wearable"
 PROCEDURE = shipped_settings(procedure="ferraris").procedure
-FITS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
 PARTS = [f"{axis}_{part}" for part in ("p", "a") for axis in "xyz"], [f"{axis}_rot" for axis in "xyz"]
 # example_data/example_ferraris_session_list.json of imucal: first sample and the one after the last
 SECTIONS = {
@@ -92,9 +87,8 @@ def read(folder: Path, file: str, counts: tuple[float, float] | None, hz: float)
         scale = {"unit": "counts", "counts_per_unit": counts[k]} if counts else {"unit": unit}
         columns |= {f"{channel}_{axis}": {"column": f"{short}_{axis}", **scale} for axis in "xyz"}
     ingest = plain.replaced(csv=plain.csv | {"columns": columns, "rate_hz": hz})
-    settings = settings_of(
-        sensor="generic", table="hand", procedure="ferraris", **{f"sensor.{name}.full_scale": 2000.0 for name in FITS}
-    )
+    full_scales = {f"sensor.{name}.full_scale": 2000.0 for name in SENSORS}
+    settings = settings_of(sensor="generic", table="hand", procedure="ferraris", **full_scales)
     return read_recordings(PROCEDURE, ingest, settings.sensor, folder), settings
 
 
@@ -112,14 +106,14 @@ def _published_sessions() -> None:
         pytest.skip("reference data not beside the repository")
 
 
-@pytest.mark.parametrize("sensor", list(FITS))
+@pytest.mark.parametrize("sensor", SENSORS)
 def test_the_example_session_agrees_with_ferraris_1995(tmp_path: Path, sensor: str) -> None:
     recordings, settings = read(tmp_path, "example_ferraris_session.csv", None, RATE_HZ)
     whole = recordings[0]
     assert whole.accelerometer is not None
     assert whole.gyroscope is not None
     force, rate = ({n: v[a:b] for n, (a, b) in SECTIONS.items()} for v in (whole.accelerometer, whole.gyroscope))
-    found = FITS[sensor].fit(StageInput(sensor, with_noise(recordings, settings), None, settings))
+    found = fitted(sensor, recordings, settings)
     assert np.abs(difference(found, ferraris(force, rate, RATE_HZ, -360.0)[sensor])).max() < 2.0
     if sensor == "gyroscope":
         turns = found.stages[-1].details.turns
@@ -129,7 +123,7 @@ def test_the_example_session_agrees_with_ferraris_1995(tmp_path: Path, sensor: s
         assert sum(found.stages[-1].details.rests_on_faces.values()) == 13
 
 
-@pytest.mark.parametrize("sensor", list(FITS))
+@pytest.mark.parametrize("sensor", SENSORS)
 def test_the_session_in_parts_agrees_with_the_published_calibration(tmp_path: Path, sensor: str) -> None:
     counts = 2080.0, 16.4  # a g, a deg/s
     recordings, settings = read(tmp_path, "annotated_session.csv", counts, 204.8)
@@ -141,7 +135,7 @@ def test_the_session_in_parts_agrees_with_the_published_calibration(tmp_path: Pa
         start, stop = float(own[0]) / 204.8, float(own[-1] + 1) / 204.8
         windows.append(Window.model_validate({"role": "rests", "axis": axis, "start_s": start, "stop_s": stop}))
     parts = cut(recordings[0], windows)
-    found = FITS[sensor].fit(StageInput(sensor, with_noise(parts, settings), None, settings))
+    found = fitted(sensor, parts, settings)
     # K R of the published file is counts a m/s^2 or deg/s. Its turns are taken as -360 deg; the readings show +360.
     short, per_unit, sign = {"accelerometer": ("a", 9.81, 1.0), "gyroscope": ("g", 1.0, -1.0)}[sensor]
     scale = counts[0] if sensor == "accelerometer" else counts[1]
