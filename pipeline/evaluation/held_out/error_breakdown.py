@@ -64,6 +64,7 @@ from pipeline.core.records import (
     Values,
     corrected,
     finite_rows,
+    motion_at_rest,
 )
 from pipeline.core.settings import Settings, Table
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, STATED_WIDTH, block_covariance
@@ -239,7 +240,6 @@ def direction_known(calibration: SensorCalibration, samples: Samples) -> bool:
 
 
 def _moved(motion: Motion, effects: Sequence[FittedEffect]) -> Motion:
-    """Return the motion after the effects of timing."""
     for fitted in effects:
         motion = effect_of(fitted).moved(motion, fitted.values)
     return motion
@@ -258,16 +258,10 @@ def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> Value
     time, spline = samples.time, make_interp_spline(samples.time, samples.magnitude, k=SPLINE_DEGREE)
     interval = float(np.median(np.diff(time)))
 
-    def motion(offset: float | Values = 0.0) -> Motion:
-        at = np.clip(time + offset, time[0] - interval, time[-1] + interval)
-        rate, nothing = np.zeros((2, len(time), 3))
-        rate[:, 0] = spline(at)
-        still = np.zeros(len(time), bool)
-        later = partial(moved_on, offset)
-        return Motion(time, nothing, rate, nothing, nothing, None, None, None, None, still, at_offset=later)
-
-    def moved_on(before: float | Values, offset: float | Values) -> Motion:
-        return motion(before + offset)
+    def motion(before: float | Values = 0.0, offset: float | Values = 0.0) -> Motion:
+        later, rate = before + offset, np.zeros((len(time), 3))
+        rate[:, 0] = spline(np.clip(time + later, time[0] - interval, time[-1] + interval))
+        return motion_at_rest(time).changed(angular_rate=rate, at_offset=partial(motion, later))
 
     return np.asarray(np.abs(_moved(motion(), effects).angular_rate[:, 0]))
 
