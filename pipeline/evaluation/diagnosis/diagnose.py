@@ -140,7 +140,7 @@ def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
             return f"the temperature changes by {span:.2g} degC, less than its resolution of {resolution:.2g} degC"
     used = [r for r in case.recordings if r.reading(case.sensor) is not None]
     noise = case.noise
-    if sheet.stated("noise_density") is not None and noise is not None and noise.step is None and used:
+    if sheet.stated("noise_density") is not None and noise.step is None and used:
         own = noise.source == "static" or (noise.source == "rests" and is_multi_position(case.sensor, case.recordings))
         excess = float(np.min(noise.white)) / sheet.white(used[0].interval) if own else 0.0
         if excess > TIMES_POSSIBLE:
@@ -169,7 +169,7 @@ def _temperatures(recordings: list[Recording]) -> tuple[float, float]:
 def diagnose(
     calibration: SensorCalibration,
     recordings: Sequence[Recording],
-    noise: Noise | None,
+    noise: Noise,
     settings: Settings,
     accelerometer: SensorCalibration | None = None,
     *,
@@ -261,19 +261,20 @@ def evidence_of(
     """
     sensor, recordings, settings, fit = case.sensor, case.recordings, case.settings, last_fit(case.calibration)
     free, full = (findings.free, findings.full) if findings else (None, None)
+    on_table = findings is None or findings.on_table
+    other = None if on_table or sensor == "accelerometer" else case.accelerometer
+    departures = [text for stage in case.calibration.stages for text in stage.details.departures or ()]
 
     def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOutError | None:
-        if fit is None or case.noise is None or findings is None:
+        if fit is None:
             return None
         try:
-            held_out = HeldOutCase(fit(), recordings, case.noise, settings, findings.other)
+            held_out = HeldOutCase(fit(), recordings, case.noise, settings, other)
             return last_error(held_out, held_out.held_out_samples(smoothed=smoothed))
         except ConvergenceError:  # the fit's effects cannot be subtracted from the held-out readings
             return None
 
-    static = None
-    if case.noise is not None:
-        static = static_error(HeldOutCase(case.calibration, recordings, case.noise, settings, case.accelerometer))
+    static = static_error(HeldOutCase(case.calibration, recordings, case.noise, settings, case.accelerometer))
     accepted = settings.sensor.of(sensor).accept_implausible
     published = held_out_of(validation) if validation else error_of(free, smoothed=False)
     contradicted = published is not None and published.above
@@ -291,7 +292,7 @@ def evidence_of(
         full=error_of(full, smoothed=True) if contradicted else None,
         doubts=[
             *doubts_of(sensor, recordings, seats=not _seats_explained(found, sensor, findings)),
-            *(findings.departures if findings else ()),
+            *(departures if findings else ()),
         ],
         approximations=[error.name for error in found.method_errors if error.name in ERRORS_OUTSIDE_UNCERTAINTY],
         unknown=[entry.covariate for entry in found.unexplained if not entry.explained_by],
@@ -308,7 +309,7 @@ def evidence_of(
         filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
         likely=found.answer_set[0].effects if found.answer_set and all(a.effects for a in found.answer_set) else (),
         held_by_limit=not_determined(case.calibration.to_json()) if settings.procedure.sheet or not fit.free else "",
-        on_table=findings is None or findings.on_table,
+        on_table=on_table,
     )
 
 

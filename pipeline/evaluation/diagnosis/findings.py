@@ -14,6 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from pipeline.core.records import (
     Answer,
     Candidate,
@@ -53,7 +55,7 @@ class DiagnosisInput:
 
     calibration: SensorCalibration
     recordings: Sequence[Recording]
-    noise: Noise | None
+    noise: Noise
     settings: Settings
     accelerometer: SensorCalibration | None
     configured: list[str]  # effects in the model: those that the settings list, and those of the bench
@@ -97,16 +99,11 @@ class Findings:
     unknown: Sequence[Dependence]
     over_noise: float | None  # rms residual of the base over the noise
     left_over_noise: float | None  # the same with the selected effects
-    noises: Sequence[tuple[Setting, float]]  # noise settings and log L
-    white: float  # noise, unit of the sensor
-    expected_wander: float | None
+    wander: Wander
     advice: Callable[[Verdict], str]  # what to record next if no effect was selected, by the verdict
     free: Callable[[], SensorCalibration] | None = None  # by a free fit of the same recordings
     full: Callable[[], SensorCalibration] | None = None  # the same with the selected effects, if there are any
-    other: SensorCalibration | None = None  # of the other sensor
     on_table: bool = True
-    departures: Sequence[str] = ()  # differences of faces and turns by hand from those that are stated
-    scatter_over_noise: float | None = None  # of the rests
     method_errors: Sequence[MethodError] = ()
     suggested_effect: Mapping[str, Any] | None = None  # content of an effect file
     table_evidence: TableEvidence | None = None
@@ -141,7 +138,7 @@ def diagnosis_of(findings: Findings, case: DiagnosisInput) -> SensorDiagnosis:
         suggested_effect=findings.suggested_effect,
         next_experiment=next_experiment(verdict, ranking, findings),
         override=override if findings.selected else "",
-        wander=_wander(findings),
+        wander=findings.wander,
         method_errors=findings.method_errors,
         on_table=findings.table_evidence,
         details=findings.details,
@@ -246,19 +243,23 @@ def implausible(findings: Findings) -> list[str]:
     return [name for name in findings.selected if not _estimates(findings, findings.steps[name])[1]]
 
 
-def _wander(findings: Findings) -> Wander:
-    """Return the most likely wander, given base, configured and selected effects, and whether it is inflated."""
-    wander, best = max(findings.noises, key=lambda noise: noise[1])
-    inflated = False
-    if findings.expected_wander is not None:
-        limit = INFLATED * max(findings.expected_wander / findings.white, LEAST_RATIO)
-        believed = [score for setting, score in findings.noises if setting.ratio <= limit]
-        inflated = wander.ratio > limit and (not believed or best - max(believed) > EVIDENCE)
+def wander_of(
+    noises: Sequence[tuple[Setting, float]], white: float, noise: Noise, scatter: float | None = None
+) -> Wander:
+    """Return the most likely wander, given base, configured and selected effects, and whether it is inflated.
+
+    ``noises``: settings and log L. ``white``: unit of the sensor. ``noise``: as expected. ``scatter``: that of rests by
+    hand, over the noise.
+    """
+    wander, best = max(noises, key=lambda each: each[1])
+    expected = float(np.sqrt(np.mean(noise.wander**2)))
+    limit = INFLATED * max(expected / white, LEAST_RATIO)
+    believed = [score for setting, score in noises if setting.ratio <= limit]
     return Wander(
         ratio=float(wander.ratio),
         time_s=float(wander.time) if wander.ratio else None,
-        standard_deviation=float(wander.ratio * findings.white),
-        expected=findings.expected_wander,
-        inflated=bool(inflated),
-        scatter_over_noise=findings.scatter_over_noise,
+        standard_deviation=float(wander.ratio * white),
+        expected=expected,
+        inflated=bool(wander.ratio > limit and (not believed or best - max(believed) > EVIDENCE)),
+        scatter_over_noise=scatter,
     )

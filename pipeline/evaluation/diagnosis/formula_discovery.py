@@ -218,10 +218,11 @@ class Forms:
         ``factor``: whose formula it is.
         """
         if text not in self._columns:
-            of_signal = factor.values(self.column(factor.signal)) if factor and factor.constants else None
-            if of_signal is None:
-                of_signal = np.concatenate([forms.values_of(parse(text), signals) for signals in self._signals])
-            self._columns[text] = of_signal
+            if factor and factor.constants:
+                self._columns[text] = factor.values(self.column(factor.signal))
+            else:
+                of_parts = [forms.values_of(parse(text), signals) for signals in self._signals]
+                self._columns[text] = np.concatenate(of_parts)
         return self._columns[text]
 
     def gains(self, tried: Sequence[Form]) -> list[FormGain]:
@@ -410,7 +411,7 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
     noise: then something else is missing. None is searched where that is certain before (``Forms.may_leave``).
     """
     noise = case.noise
-    floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
+    floor = float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
     best, least = Discovery(selection, selection, unknown), _criterion(selection, []) + MIN_DELTA_BIC
     alone, grammar = replace(selection, steps={}, fit=selection.base), None
     tried: list[tuple[Sequence[str], Sequence[str]]] = []

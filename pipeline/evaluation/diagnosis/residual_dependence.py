@@ -53,7 +53,7 @@ from pipeline.estimation.gauss_markov import WHITE_SETTING, Blocks, Products, Se
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.multi_position.fit import solve
 from pipeline.estimation.observations import Observations
-from pipeline.estimation.ranking import projection
+from pipeline.estimation.ranking import by_size, projection
 from pipeline.estimation.selection import Selection
 from pipeline.evaluation.diagnosis.form_scan import ProjectedCurves, Scan, Whitened, each_explains
 from pipeline.evaluation.diagnosis.functional_forms import Curves, Span, available_signals, columns_of, signals_of
@@ -136,8 +136,7 @@ def _tests_of_curves(bases: Sequence[Basis], scan: Scan, projected: ProjectedCur
     """Return the tests with the smooth curves, ``projected``."""
     tests = [*_independent(bases, projected)]
     drops = [np.zeros((*scan.left.shape, 0))] * len(tests)
-    for size in {len(index) for _, index, _ in tests}:
-        of_size = [k for k, (_, index, _) in enumerate(tests) if len(index) == size]
+    for of_size in by_size(len(index) for _, index, _ in tests):
         together = projected.drop([tests[k][1] for k in of_size])
         for k, each in zip(of_size, np.moveaxis(together, 2, 0), strict=True):
             drops[k] = each[:, :, tests[k][2] - 1 :]
@@ -292,7 +291,7 @@ def _force(motion: Motion) -> Values:
     return np.concatenate([chebvander(scaled[:, i], CURVE_DEGREE)[:, 3:] for i in range(3)], axis=1)
 
 
-def plots(selection: Selection, unexplained: Sequence[Dependence], noise: Noise | None, reported: Selection) -> JSON:
+def plots(selection: Selection, unexplained: Sequence[Dependence], noise: Noise, reported: Selection) -> JSON:
     """Return the points of the plots of a diagnosis.
 
     ``unexplained``: the dependences for ``selection``. ``reported``: the selection that the diagnosis reports, with a
@@ -387,10 +386,10 @@ def _most_significant(term: EffectColumns, sensor: str, ratio: Values) -> list[i
     return [j if ratio[j] >= 0.0 else None for j in largest]
 
 
-def _unexplained(selection: Selection, shown: Sequence[Dependence], noise: Noise | None) -> list[JSON]:
+def _unexplained(selection: Selection, shown: Sequence[Dependence], noise: Noise) -> list[JSON]:
     """Return the plots of the residual against covariates, with the curve of a suggested form."""
     regression, setting, plots, blocks = _Columns(selection), WHITE_SETTING, [], selection.observations.blocks
-    if noise is not None and np.any(noise.wander > 0):  # as expected: the fitted wander may contain the dependence
+    if np.any(noise.wander > 0):  # as expected: the fitted wander may contain the dependence
         setting = Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
     covariance = blocks.covariance(setting.time)
     sigma = regression.white_noise(regression.residual - regression.wander(selection.fit.setting))
@@ -404,7 +403,7 @@ def _unexplained(selection: Selection, shown: Sequence[Dependence], noise: Noise
             if coefficients is not None:
                 residual = regression.left_of(c, regression.residual[:, c] - form, setting) + form
             variance = sigma[c] ** 2 / bins.weight
-            if noise is not None and noise.wander[c] > 0.0:
+            if noise.wander[c] > 0.0:
                 variance += noise.wander[c] ** 2 * bins.bias_of_means(blocks, covariance)
             panels.append({"axis": "xyz"[c]} | bins.document(residual, variance))
             if entry.form and coefficients is not None:

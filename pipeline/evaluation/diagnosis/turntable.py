@@ -24,7 +24,7 @@ import numpy as np
 
 from pipeline.core.errors import ConvergenceError
 from pipeline.core.files import JSON
-from pipeline.core.records import BASE_COUNT, Index, Noise, SelectionErrors, SensorCalibration, TableEvidence, Values
+from pipeline.core.records import BASE_COUNT, Index, SelectionErrors, SensorCalibration, TableEvidence, Values
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Design, EffectColumns, placed
@@ -37,7 +37,7 @@ from pipeline.estimation.posterior import completed, curves_of, posterior
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import ABOVE_NOISE, FAR_ABOVE, Selection, select
 from pipeline.estimation.stages import last_fit
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, implausible
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, implausible, wander_of
 from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, why_not_suggested
 from pipeline.evaluation.diagnosis.method_errors import method_errors
 from pipeline.evaluation.diagnosis.residual_dependence import dependences, goodness_of_fit, plots
@@ -52,7 +52,6 @@ MOST_OF = 0.5  # share of the gain that the listed seconds have together
 MAX_INFLUENTIAL_STRETCHES = 5  # that a page lists
 DETERMINED = 1e-6  # least information on an effect's weakest direction, over that of all recordings
 NEEDED_RECORDING = "record turns about all three axes on a table whose angle and rate are logged"
-NOISELESS = Noise(np.zeros(3), np.zeros(3), 1.0, "none")  # of recordings that determine no noise
 
 
 def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
@@ -232,15 +231,12 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
     suggested = [str(discovery.suggested["name"])] if discovery.suggested else []  # in the base of ``reported``
     if suggested:  # the override adds no formula
         harmful = _held_out(reported, fits_of(reported, suggested), case)[2]
-    held_out = None
-    if errors and noise is not None:
-        held_out = SelectionErrors(errors[0], errors[-1], floor)
+    held_out = SelectionErrors(errors[0], errors[-1], floor) if errors else None
     hidden = not_observable(reported, case.modelled)
     squares = [fit.residual_rms**2 for fit in fits]
-    noise_square = None if noise is None else observations.noise_square(noise)
-    least = squares[-1] if noise_square is None else noise_square
-    at_noise = not reported.names and squares[0] < ABOVE_NOISE * least
-    excess = squares[0] if at_noise else squares[0] - min(least, squares[-1])
+    noise_square = observations.noise_square(noise)
+    at_noise = not reported.names and squares[0] < ABOVE_NOISE * noise_square
+    excess = squares[0] if at_noise else squares[0] - min(noise_square, squares[-1])
     curves = curves_of(selection) if selection.names or unknown else []
     answers = posterior(selection, [*never_shown(hidden, reported.names), *known_harmful], curves)
     verdict = verdict_of_selection(
@@ -248,7 +244,7 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         unknown,
         float(np.clip((squares[0] - squares[-1]) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0,
         2.0 * (reported.fit.log_likelihood - reported.base.log_likelihood),
-        above_noise=noise_square is not None and squares[-1] > FAR_ABOVE**2 * noise_square,
+        above_noise=squares[-1] > FAR_ABOVE**2 * noise_square,
         held_out=held_out,
         beyond=max((answers.probability(curve.name) for curve in curves), default=0.0),
     )
@@ -293,9 +289,7 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         unknown=unknown,
         over_noise=_over_noise(selection.base, case, observations),
         left_over_noise=_over_noise(selection.fit, case, observations),
-        noises=noises,
-        white=float(np.sqrt(white_square)),
-        expected_wander=None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
+        wander=wander_of(noises, float(np.sqrt(white_square)), noise),
         advice=advice,
         free=lambda: calibrated(selection.base),
         full=(lambda: calibrated(selection.fit)) if selection.names else None,
@@ -326,8 +320,7 @@ def _held_out(
     wanders as in the recordings of the fit, if that is more than in a rest. Without held-out motion the list is empty,
     and stretches of the turns that are left out judge the effects.
     """
-    noise = case.noise or NOISELESS
-    held_out = HeldOutCase(case.calibration, case.recordings, noise, case.settings)
+    noise, held_out = case.noise, HeldOutCase(case.calibration, case.recordings, case.noise, case.settings)
     samples = held_out.held_out_samples(smoothed=True) if selection.names else []
     if not any(s.known.any() for s in samples):
         return [], 0.0, harmful_in_turns(selection, fits)
@@ -355,8 +348,6 @@ def _shares(selection: Selection, name: str) -> dict[str, float]:
 
 def _over_noise(fit: JointFit, case: DiagnosisInput, observations: Observations) -> float | None:
     """Return the rms residual of a fit over that of noise alone."""
-    if case.noise is None:
-        return None
     gain = max(float(r.filter.get("noise_gain", 1.0)) for r in case.recordings)
     floor = float(np.sqrt(observations.noise_square(case.noise, gain)))
     return float(fit.residual_rms / floor) if floor > 0 else None
