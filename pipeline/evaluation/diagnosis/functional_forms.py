@@ -86,33 +86,19 @@ def available_signals(observations: Observations) -> list[str]:
     return names + (["time"] if observations.clock_shared else [])
 
 
-@dataclass(frozen=True)
 class Span:
-    """The sorted values of a signal in all rows."""
+    """The sorted values of a signal in all rows, the smallest and the largest, and the difference of these."""
 
-    signal: str
-    values: Values
+    def __init__(self, signal: str, values: Values) -> None:
+        self.signal, self.values = signal, np.sort(values)
+        self.low, self.high = float(self.values[0]), float(self.values[-1])
+        self.size = max(self.high - self.low, 1e-12)
 
     @classmethod
     def of(cls, observations: Observations, signal: str) -> Span:
         """Return the span of a signal."""
         known = (signals_of(part.motion, observations.sensor) for part in observations.parts)
-        return cls(signal, np.sort(np.concatenate([each[signal][:, 0] for each in known if signal in each])))
-
-    @property
-    def low(self) -> float:
-        """Smallest value."""
-        return float(self.values[0])
-
-    @property
-    def high(self) -> float:
-        """Largest value."""
-        return float(self.values[-1])
-
-    @property
-    def size(self) -> float:
-        """Largest less smallest value."""
-        return max(self.high - self.low, 1e-12)
+        return cls(signal, np.concatenate([each[signal][:, 0] for each in known if signal in each]))
 
     def places(self) -> Values:
         """Return the places of steps in the coarse scan: evenly over the span, or between constant speeds."""

@@ -281,7 +281,7 @@ def _dependences(selection: SelectionByHand) -> list[Dependence]:
     for covariate, values in (("time", rests.time), ("temperature", rests.temperature)):
         known = rests.clock_shared if covariate == "time" else not np.isnan(values).any()
         if known and np.ptp(values) > LEAST_SPAN:
-            powers = forms.powers(forms.Span(covariate, np.sort(values)), covariate)
+            powers = forms.powers(forms.Span(covariate, values), covariate)
             tests += [(covariate, powers[:degree]) for degree in (2, 3)]
     if model.sensor == "accelerometer":
         tests.append(("specific_force", FORCE))

@@ -38,7 +38,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -326,7 +325,7 @@ def _added_variable(regression: _Columns, selection: Selection) -> JSON:
     for c, j, x, of_axis in chosen:
         if term.effect.layout == Layout.SHARED and of_axis < MIN_INFORMATION_SHARE * information:
             continue
-        bins = Bins.of(x, regression.weight)
+        bins = Bins(x, regression.weight)
         points = bins.document(term.values[j] * x + white[:, c], sigma[c] ** 2 / bins.weight)
         panels.append({"axis": "xyz"[c], **_coefficient(term, sensor, j, uncertainty[j]), **points})
     return {"effect": selection.names[0], "unit": unit_of(sensor), "panels": panels}
@@ -398,7 +397,7 @@ def _unexplained(selection: Selection, shown: Sequence[Dependence], noise: Noise
         signal, forms = _signal_forms(selection, entry)
         values, panels = _values(selection, signal), []
         for c, (form, coefficients) in enumerate(forms):
-            bins = Bins.of(values[:, c], regression.weight)
+            bins = Bins(values[:, c], regression.weight)
             residual = left[c]
             if coefficients is not None:
                 residual = regression.left_of(c, regression.residual[:, c] - form, setting) + form
@@ -475,26 +474,22 @@ class _Columns:
         return np.asarray(values - self.columns[c] @ known[:, -1])
 
 
-@dataclass(frozen=True)
 class Bins:
-    """The filled ones of 40 equal bins of a covariate."""
+    """The filled ones of 40 equal bins of a covariate, whose (n,) values are not finite where it is unknown.
 
-    cell: Index  # (n,), bin of each row; one beyond the last if the covariate is unknown
-    row_weight: Values  # (n,)
-    weight: Values  # (b,), sum over the rows of a bin
-    centre: Values  # (b,), weighted mean of the covariate
+    ``cell``: (n,), bin of each row; one beyond the last where the covariate is unknown. ``weight``: (b,), sum over the
+    rows of a bin. ``centre``: (b,), weighted mean of the covariate.
+    """
 
-    @classmethod
-    def of(cls, values: Values, weight: Values) -> Bins:
-        """Return the bins of a covariate; its (n,) values are not finite if unknown."""
+    def __init__(self, values: Values, weight: Values) -> None:
         known = np.isfinite(values)
         low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
         place = np.full(len(values), PLOT_BINS)
         place[known] = np.minimum((values[known] - low) * (PLOT_BINS / max(high - low, 1e-300)), PLOT_BINS - 1)
         filled, cell = np.unique(np.append(place, PLOT_BINS), return_inverse=True)
-        total: Values = np.bincount(cell[:-1], weight, len(filled))[:-1].astype(float)
-        first = cls(cell[:-1], weight, total, np.zeros(0))
-        return cls(first.cell, weight, total, first.mean(np.where(known, values, 0.0)))
+        self.cell, self.row_weight = cell[:-1], weight
+        self.weight: Values = np.bincount(self.cell, weight, len(filled))[:-1].astype(float)
+        self.centre = self.mean(np.where(known, values, 0.0))
 
     def mean(self, values: Values) -> Values:
         """Return the weighted means of (n,) values: (b,) array."""
