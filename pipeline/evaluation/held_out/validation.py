@@ -143,41 +143,41 @@ def validate(
         elif samples := case.fit_samples():
             reason += "; judged on the samples of the fit"
     count = int(sum(s.known.sum() for s in samples))
-    part = SensorValidation(
-        unit=unit_of(sensor),
-        held_out=reason is None,
-        reason=reason,
-        samples=count,
-        noise=noise,
-        steps=(StepErrors("raw"), StepErrors("calibrated")),
-    )
-    if count:
-        steps, notes = breakdown.error_breakdown(calibration, samples)
-        floor, vector_floor = noise_floor(calibration, samples), vector_noise_floor(calibration, samples)
-        part = replace(
-            part,
-            noise_floor=floor,
-            vector_noise_floor=vector_floor,
-            reference_rms=float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2))),
-            steps=tuple(steps),
-            over_temperature=_over_temperature(case, samples, held_out=part.held_out),
+    held_out, limits = reason is None, settings.limits.of(sensor)
+    about: dict[str, Any] = {"unit": unit_of(sensor), "held_out": held_out, "reason": reason, "samples": count}
+    if not count:
+        nothing = StepErrors("raw"), StepErrors("calibrated")
+        checked = _check_limits(calibration, nothing[-1], limits)
+        return SensorValidation(**about, noise=noise, steps=nothing, limits=checked)
+    steps, notes = breakdown.error_breakdown(calibration, samples)
+    expected, agreement, worse = None, None, None
+    known = [s for s in samples if s.known.any()]
+    if names := breakdown.left_out(calibration, known):
+        verb = "is" if len(names) == 1 else "are"
+        notes.append(
+            f"the expected error is not stated, because {', '.join(names)} {verb} left out of the held-out error"
         )
-        known = [s for s in samples if s.known.any()]
-        if names := breakdown.left_out(calibration, known):
-            verb = "is" if len(names) == 1 else "are"
-            notes.append(
-                f"the expected error is not stated, because {', '.join(names)} {verb} left out of the held-out error"
-            )
-        else:
-            parts = [breakdown.linearized(calibration, s) for s in known]
-            expected = _expected(case, parts)
-            part = replace(part, expected_rms_error=expected)
-            notes += [EARTH_LEFT_OUT] if any(s.earth_left_out for s in samples) else []
-            if part.held_out:
-                worse = _worse_than_raw(case, known, steps, expected[1])
-                part = replace(part, agreement=_agreement(case, parts), worse_than_raw=worse)
-        part = replace(part, notes=tuple(notes), reduced=tuple(reduced(case, samples, held_out=part.held_out)))
-    return replace(part, limits=_check_limits(calibration, part.steps[-1], settings.limits.of(sensor)))
+    else:
+        parts = [breakdown.linearized(calibration, s) for s in known]
+        expected = _expected(case, parts)
+        notes += [EARTH_LEFT_OUT] if any(s.earth_left_out for s in samples) else []
+        if held_out:
+            agreement, worse = _agreement(case, parts), _worse_than_raw(case, known, steps, expected[1])
+    return SensorValidation(
+        **about,
+        noise=noise,
+        noise_floor=noise_floor(calibration, samples),
+        vector_noise_floor=vector_noise_floor(calibration, samples),
+        reference_rms=float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2))),
+        steps=tuple(steps),
+        notes=tuple(notes),
+        expected_rms_error=expected,
+        worse_than_raw=worse,
+        agreement=agreement,
+        over_temperature=_over_temperature(case, samples, held_out=held_out),
+        reduced=tuple(reduced(case, samples, held_out=held_out)),
+        limits=_check_limits(calibration, steps[-1], limits),
+    )
 
 
 def _over_temperature(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) -> OverTemperature | None:
