@@ -16,7 +16,7 @@ If an effect is missing, bias and sides are not compared, since the effect shift
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -66,7 +66,7 @@ def method_errors(
     if more:
         free = fit_terms(selection.observations, [*free.terms, *more], free, selection.settings)
     of_free = free.covariance, np.kron(calibration.matrix, np.eye(3))
-    difference = _Difference.of(calibration, free.bias, free.K, of_free, settings)
+    difference = _Difference(calibration, free.bias, free.K, of_free, settings)
     of_roles = ([r for r in recordings if r.role == role] for role in (calibration.sensor, "validation"))
     of_turns, of_held_out = (_errors(difference, free, each, settings.table) for each in of_roles)
     shares = {
@@ -93,7 +93,7 @@ def given_differences(
     free = free_fit()
     K = np.asarray(np.linalg.inv(free.matrix), np.float64)
     of_free = free.covariance, np.kron(calibration.matrix @ K, K.T)
-    difference = _Difference.of(calibration, free.bias, K, of_free, settings)
+    difference = _Difference(calibration, free.bias, K, of_free, settings)
     del difference.matrices["rotation"]
     rates = [np.sum(w**2, axis=1) for r in recordings if (w := r.reading("gyroscope")) is not None]
     size = 1.0 if calibration.sensor == "accelerometer" else float(np.sqrt(np.nanmean(np.concatenate(rates))))
@@ -102,21 +102,15 @@ def given_differences(
     return _named(difference, rms, recordings)
 
 
-@dataclass(frozen=True)
 class _Difference:
-    method: SensorCalibration
-    bias: Values  # (3,): M (b - b_m)
-    matrices: dict[str, Values]  # (3, 3) parts of E
-    uncertainty: Values  # (12,), of bias and E
+    """The difference of a method's calibration from a free fit, of bias b and matrix K.
 
-    @classmethod
-    def of(
-        cls, method: SensorCalibration, bias: Values, K: Values, of_free: tuple[Values | None, Any], settings: Settings
-    ) -> _Difference:
-        """Return the difference from a free fit.
+    ``of_free``: covariance of the free fit's bias and matrix, and (9, 9) derivative of E to this matrix.
+    """
 
-        ``of_free``: covariance of the free fit's bias and matrix, and (9, 9) derivative of E to this matrix.
-        """
+    def __init__(
+        self, method: SensorCalibration, b: Values, K: Values, of_free: tuple[Values | None, Any], settings: Settings
+    ) -> None:
         M, variance = method.matrix, np.zeros(BASE_COUNT)
         for covariance, derivative in (of_free, (_covariance(method, settings), np.kron(np.eye(3), K.T))):
             if covariance is not None:
@@ -125,7 +119,9 @@ class _Difference:
         E = M @ K - np.eye(3)
         diagonal = np.diag(np.diag(E))
         parts = {"scale_factor": diagonal, "non_orthogonality": 0.5 * (E + E.T) - diagonal, "rotation": 0.5 * (E - E.T)}
-        return cls(method, M @ (bias - method.bias), parts, np.sqrt(np.clip(variance, 0.0, None)))
+        self.method, self.bias = method, M @ (b - method.bias)
+        self.matrices: dict[str, Values] = parts
+        self.uncertainty = np.sqrt(np.clip(variance, 0.0, None))  # (12,), of bias and E
 
     def errors(self, motion: Motion, free: JointFit) -> dict[str, Values]:
         """Return the error of the calibrated reading by cause, without that of the filter: (n, 3) arrays."""
