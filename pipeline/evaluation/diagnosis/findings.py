@@ -40,7 +40,6 @@ from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.ranking import Score
 from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
-from pipeline.evaluation.diagnosis.verdict import if_observable
 from pipeline.evaluation.diagnosis.words import experiment_of, listed, of_unknown, plain, to_distinguish
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.equations import OTHER_PREFIX
@@ -119,7 +118,8 @@ def diagnosis_of(findings: Findings, case: DiagnosisInput) -> SensorDiagnosis:
     others = sorted(findings.alone.values(), key=lambda score: -score.delta_bic)
     unselected = [s.name for s in others if s.name not in findings.selected and s.name not in findings.hidden]
     ranking = [_entry(findings, name) for name in (*findings.selected, *unselected)]
-    verdict = if_observable(findings.verdict, ranking, findings.hidden)
+    shows_nothing = findings.verdict == Verdict.NOTHING_MISSING and not ranking and findings.hidden
+    verdict = Verdict.NOT_ENOUGH_DATA if shows_nothing else findings.verdict
     override = f"effects.{case.sensor}=[{','.join([*listed, *findings.selected])}]"
     answers = findings.answers
     sets = [Answer(names, min(p, CERTAIN)) for names, p in answers.answer_set()]
