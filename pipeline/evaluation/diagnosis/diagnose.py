@@ -69,7 +69,7 @@ from pipeline.evaluation.diagnosis.verdict import (
     may_be_unknown,
 )
 from pipeline.evaluation.diagnosis.words import plain
-from pipeline.evaluation.held_out.error_breakdown import last_step, vector_errors
+from pipeline.evaluation.held_out.error_breakdown import left_out, vector_errors, with_known_effects
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, samples_of_motion
 from pipeline.evaluation.held_out.validation import HeldOutError, last_error, static_error
 from pipeline.physics.effects import catalogue, effect, effect_of
@@ -415,20 +415,20 @@ def effective_noise(
     held_out = [r for r in recordings if r.role == "validation"]
     of_motion = ((r, samples_of_motion(calibration.sensor, r, noise, table, other=other)) for r in held_out)
     samples = [(r, s) for r, s in of_motion if s is not None]
-    last = [(r, s, last_step(calibration, s)) for r, s in samples]
-    errors = [(r, (s.time, vector_errors([e], directed=e[2] is not None))) for r, s, e in last if e is not None]
-    if not errors:
+    used = [(r, s) for r, s in samples if not left_out(calibration, [s])]
+    if not used:
         return None
+    errors = [_about_mean(s.time, vector_errors([with_known_effects(calibration, s)], directed=True)) for _, s in used]
     of_effects = {}
     for name in found.selected:
         of_effect = [(s.time, _of_effect(calibration, s, found, name)) for _, s in samples]
         if all(error is not None for _, error in of_effect):
             of_effects[name] = [_about_mean(*error) for error in of_effect]
-    interval, of_all = errors[0][0].interval, [_about_mean(*error) for _, error in errors]
+    interval = used[0][0].interval
     white = float(np.sqrt(np.mean(noise.white**2) * interval))
     densities = []
     for time in dict.fromkeys(max(1, round(t / interval)) * interval for t in AVERAGING_TIMES_S):  # whole samples
-        density = _density(of_all, time)
+        density = _density(errors, time)
         if density is None:
             continue
         shares = [{"effect": name, "density": _density(parts, time)} for name, parts in of_effects.items()]
@@ -437,9 +437,8 @@ def effective_noise(
         densities.append(entry)
     if not densities:
         return None
-    used = [r for r, _ in errors]
-    about = {"unit": f"{unit_of(calibration.sensor)}/sqrt(Hz)", "recordings": [r.name for r in used]}
-    return about | {"motion": _motion(used), "white": white, "densities": densities}
+    about = {"unit": f"{unit_of(calibration.sensor)}/sqrt(Hz)", "recordings": [r.name for r, _ in used]}
+    return about | {"motion": _motion([r for r, _ in used]), "white": white, "densities": densities}
 
 
 def _of_effect(calibration: SensorCalibration, samples: Samples, found: SensorDiagnosis, name: str) -> Values | None:

@@ -114,13 +114,6 @@ def error_breakdown(calibration: SensorCalibration, samples: Sequence[Samples]) 
     return rows if directed else [replace(row, vector_rms_error=None) for row in rows], notes
 
 
-def last_step(calibration: SensorCalibration, samples: Samples) -> Corrected | None:
-    """Return calibrated readings, magnitude and vector of the reference with all effects; None if one is left out."""
-    if left_out(calibration, [samples]):
-        return None
-    return _with_effects(calibration, calibration.effects, samples)
-
-
 def left_out(calibration: SensorCalibration, samples: Sequence[Samples]) -> list[str]:
     """Return the names of the effects that cannot be subtracted from some of the samples."""
     return [fitted.name for fitted in calibration.effects if any(_lack(fitted, s) for s in samples)]
@@ -157,7 +150,7 @@ def vector_errors(corrected: Sequence[Corrected], *, directed: bool) -> Values:
 
 
 def with_known_effects(calibration: SensorCalibration, samples: Samples) -> Corrected:
-    """Return the same as ``last_step``, with the effects that can be subtracted from the samples."""
+    """Return calibrated readings, magnitude and vector of the reference, with the effects that can be subtracted."""
     return _with_effects(calibration, [fitted for fitted in calibration.effects if not _lack(fitted, samples)], samples)
 
 
