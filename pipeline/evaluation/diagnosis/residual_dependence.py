@@ -48,7 +48,7 @@ from pipeline.core.files import JSON
 from pipeline.core.records import BASE_COUNT, Dependence, Index, Motion, Noise, Values
 from pipeline.estimation.design import EffectColumns, placed
 from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
-from pipeline.estimation.gauss_markov import WHITE_SETTING, Blocks, Products, Setting, selection_grid
+from pipeline.estimation.gauss_markov import Blocks, Products, Setting, selection_grid
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.multi_position.fit import solve
 from pipeline.estimation.observations import Observations
@@ -387,23 +387,18 @@ def _most_significant(term: EffectColumns, sensor: str, ratio: Values) -> list[i
 
 def _unexplained(selection: Selection, shown: Sequence[Dependence], noise: Noise) -> list[JSON]:
     """Return the plots of the residual against covariates, with the curve of a suggested form."""
-    regression, setting, plots, blocks = _Columns(selection), WHITE_SETTING, [], selection.observations.blocks
-    if np.any(noise.wander > 0):  # as expected: the fitted wander may contain the dependence
-        setting = Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
+    regression, plots, blocks = _Columns(selection), [], selection.observations.blocks
+    # as expected: the fitted wander may contain the dependence
+    setting = Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
     covariance = blocks.covariance(setting.time)
     sigma = regression.white_noise(regression.residual - regression.wander(selection.fit.setting))
-    left = [regression.left_of(c, regression.residual[:, c], setting) for c in range(3)]
     for entry in shown:
         signal, forms = _signal_forms(selection, entry)
         values, panels = _values(selection, signal), []
         for c, (form, coefficients) in enumerate(forms):
             bins = Bins(values[:, c], regression.weight)
-            residual = left[c]
-            if coefficients is not None:
-                residual = regression.left_of(c, regression.residual[:, c] - form, setting) + form
-            variance = sigma[c] ** 2 / bins.weight
-            if noise.wander[c] > 0.0:
-                variance += noise.wander[c] ** 2 * bins.bias_of_means(blocks, covariance)
+            residual = regression.left_of(c, regression.residual[:, c] - form, setting) + form
+            variance = sigma[c] ** 2 / bins.weight + noise.wander[c] ** 2 * bins.bias_of_means(blocks, covariance)
             panels.append({"axis": "xyz"[c]} | bins.document(residual, variance))
             if entry.form and coefficients is not None:
                 grid = np.linspace(float(np.nanmin(values[:, c])), float(np.nanmax(values[:, c])), CURVE)
