@@ -194,7 +194,6 @@ def _without_creep(case: DiagnosisInput) -> Noise:
 
 
 def _shares(selection: SelectionByHand, name: str) -> dict[str, float]:
-    """Return the share of an effect's fitted signal that each other effect reproduces."""
     scored = selection.own[name] if name in selection.names else selection.first
     signal = scored.signal.get(name)
     if signal is None or not signal.any():

@@ -223,7 +223,6 @@ def _found(selection: Selection, case: DiagnosisInput, harmful: Mapping[str, str
 
 
 def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mapping[str, str]) -> Findings:
-    """Return the findings of a selection and a discovery."""
     sensor, noise, selection, reported = case.sensor, case.noise, discovery.context, discovery.reported
     observations, unknown = selection.observations, discovery.unknown
     fits = fits_of(reported)
@@ -339,7 +338,6 @@ def _held_out(
 
 
 def _shares(selection: Selection, name: str) -> dict[str, float]:
-    """Return the share of an effect's fitted signal that each other effect reproduces."""
     if name in selection.names:
         chosen, ranking = selection.chosen(), selection.ranking
         return ranking.shares(ranking.indices(name)[0], chosen, ranking.of_model(chosen)[1])

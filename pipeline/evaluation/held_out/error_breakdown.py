@@ -210,7 +210,6 @@ def _elsewhere(fitted: FittedEffect, samples: Samples) -> bool:
 
 
 def _with_effects(calibration: SensorCalibration, effects: Sequence[FittedEffect], samples: Samples) -> Corrected:
-    """Return calibrated readings, magnitude and vector of the reference with some effects."""
     effects = [fitted for fitted in effects if not _elsewhere(fitted, samples)]
     if not effects:
         return _uncorrected(samples, linear_truth(calibration, samples.reading))

@@ -325,7 +325,6 @@ def vector_noise_floor(calibration: SensorCalibration, samples: Sequence[Samples
 
 
 def _why_not_held_out(case: HeldOutCase) -> str:
-    """Return why no samples are held out."""
     reason = f"no held-out recording holds readings of the {case.calibration.sensor} and a reference for them"
     procedure = case.settings.procedure
     if procedure.sheet is not None:
