@@ -199,19 +199,10 @@ def _found(selection: Selection, case: DiagnosisInput, harmful: Mapping[str, str
 
     def search() -> Findings | None:
         discovery = discover(selection, unknown, case)
-        if not discovery.suggested:
-            return None
         try:
-            described = _described(discovery, case, harmful)
+            return _described(discovery, case, harmful) if discovery.suggested else None
         except ConvergenceError:  # the form cannot be subtracted from held-out readings, so it is no effect of a sensor
             return None
-        reason = why_not_suggested(discovery, described.hidden)
-        if reason is None:
-            return described
-        formulas = [replace(formula, suggested=False) for formula in discovery.front]
-        held_out = described.table_evidence.held_out if described.table_evidence else None
-        evidence = TableEvidence(held_out, formulas, reason)
-        return replace(described, suggested_effect=None, table_evidence=evidence)
 
     catalogue_alone = Discovery(selection, selection, unknown)
     try:
@@ -232,6 +223,9 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         harmful = _held_out(reported, fits_of(reported, suggested), case)[2]
     held_out = SelectionErrors(errors[0], errors[-1], floor) if errors else None
     hidden = not_observable(reported, case.modelled)
+    not_shown = {**hidden, **alike_with_zeros(reported)}
+    reason = why_not_suggested(discovery, not_shown) if discovery.suggested else None
+    formulas = discovery.front if reason is None else [replace(each, suggested=False) for each in discovery.front]
     squares = [fit.residual_rms**2 for fit in fits]
     noise_square = observations.noise_square(noise)
     at_noise = not reported.names and squares[0] < ABOVE_NOISE * noise_square
@@ -284,7 +278,7 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         excess=excess,
         held_out=errors or [None] * len(fits),
         harmful={**known_harmful, **harmful},
-        hidden={**hidden, **alike_with_zeros(reported)},
+        hidden=not_shown,
         unknown=unknown,
         over_noise=_over_noise(selection.base, case, observations),
         left_over_noise=_over_noise(selection.fit, case, observations),
@@ -293,8 +287,8 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         free=lambda: calibrated(selection.base),
         full=(lambda: calibrated(selection.fit)) if selection.names else None,
         method_errors=method_errors(case.calibration, reported, case.recordings, case.settings),
-        suggested_effect=discovery.suggested,
-        table_evidence=TableEvidence(held_out, discovery.front),
+        suggested_effect=discovery.suggested if reason is None else None,
+        table_evidence=TableEvidence(held_out, formulas, reason),
         details={
             "pictures": plots(selection, unknown, noise, reported),
             "rows": {
