@@ -37,6 +37,7 @@ from pipeline.estimation.gates import MAX_MIN_DELTA_BIC, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import Observations, without_each_recording, without_rows
+from pipeline.estimation.ranking import by_size
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.evaluation.diagnosis import functional_forms as forms
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput
@@ -111,23 +112,16 @@ class FormProducts:
             return known[key]
 
         known: dict[tuple[int, tuple[str, ...], tuple[str, ...]], list[list[int]]] = {}
-        alike: dict[tuple[int, int], list[int]] = {}  # forms whose columns have the same shape
         pairs = []  # places of both kinds on each axis
-        for k, form in enumerate(tried):
-            alike.setdefault((len(form.factor.texts), 3 if "u" in form.signals else 1), []).append(k)
+        for form in tried:
             modulator = places(1, form.modulator) if apart and form.modulator else [[0]] * 3
             pairs.append((places(0, form.factor, None if apart else form.modulator), modulator))
-        self.alike = [
-            (
-                r,
-                members,
-                [
-                    [np.array([each[axis] for each in kind]) for kind in zip(*(pairs[k] for k in members), strict=True)]
-                    for axis in range(axes)
-                ],
-            )
-            for (r, axes), members in alike.items()
-        ]
+        # of forms whose columns have the same shape: number of columns, which forms, and their places on each axis
+        self.alike: list[tuple[int, list[int], list[tuple[Index, Index]]]] = []
+        for members in by_size((len(form.factor.texts), "u" in form.signals) for form in tried):
+            first, axes = tried[members[0]], range(3 if "u" in tried[members[0]].signals else 1)
+            f, m = (np.array(each) for each in zip(*(pairs[k] for k in members), strict=True))
+            self.alike.append((len(first.factor.texts), members, [(f[:, axis], m[:, axis]) for axis in axes]))
         F, G = self.columns = [np.stack(known, axis=1) for known in kinds]
         weighted, edges = scan.weight[:, None] * G, [*scan.blocks.first.tolist(), len(F)]
         sums = np.stack([F[at].T @ weighted[at] for at in starmap(slice, pairwise(edges))])

@@ -70,10 +70,10 @@ def method_errors(
     of_roles = ([r for r in recordings if r.role == role] for role in (calibration.sensor, "validation"))
     of_turns, of_held_out = (_errors(difference, free, each, settings.table) for each in of_roles)
     shares = {
-        "held_out_share": _shares({name: _rms(error) for name, (error, _) in of_held_out.items()}),
-        "held_out_magnitude_share": _shares({name: _rms(error) for name, (_, error) in of_held_out.items()}),
+        "held_out_share": _shares({name: of_vector for name, (of_vector, _) in of_held_out.items()}),
+        "held_out_magnitude_share": _shares({name: of_size for name, (_, of_size) in of_held_out.items()}),
     }
-    rms = {name: _rms(error) for name, (error, _) in of_turns.items()}
+    rms = {name: of_vector for name, (of_vector, _) in of_turns.items()}
     return _named(difference, rms, recordings, selection.names, shares, printed=settings.method.as_printed)
 
 
@@ -161,8 +161,8 @@ def _covariance(calibration: SensorCalibration, settings: Settings) -> Values:
 
 def _errors(
     difference: _Difference, free: JointFit, recordings: Sequence[Recording], table: Table
-) -> dict[str, tuple[Values, Values]]:
-    """Return the errors by cause in the recordings with a known motion: (n, 3), and of the magnitude: (n,)."""
+) -> dict[str, tuple[float, float]]:
+    """Return the rms error by cause in the recordings with a known motion: of the vector, and of the magnitude."""
     sensor = difference.method.sensor
     found: dict[str, list[tuple[Values, Values]]] = {}
     for recording in recordings:
@@ -180,10 +180,7 @@ def _errors(
             late = recording.time - float(recording.filter.get("delay_s", 0.0))
             delayed = np.interp(late, recording.time, np.linalg.norm(unfiltered, axis=1))
             found.setdefault("filter_delay", []).append((u - unfiltered, size - delayed))
-    return {
-        name: (np.concatenate([vector for vector, _ in errors]), np.concatenate([magnitude for _, magnitude in errors]))
-        for name, errors in found.items()
-    }
+    return {name: (_rms([v for v, _ in errors]), _rms([m for _, m in errors])) for name, errors in found.items()}
 
 
 def _shares(rms: Mapping[str, float]) -> dict[str, float]:
@@ -191,7 +188,8 @@ def _shares(rms: Mapping[str, float]) -> dict[str, float]:
     return {name: size**2 / total for name, size in rms.items()} if total > 0.0 else {}
 
 
-def _rms(errors: Values) -> float:
+def _rms(parts: Sequence[Values]) -> float:
+    errors = np.concatenate(parts)
     return float(np.sqrt(np.sum(errors**2) / len(errors)))
 
 
