@@ -261,7 +261,7 @@ def evidence_of(
     """
     sensor, recordings, settings, fit = case.sensor, case.recordings, case.settings, last_fit(case.calibration)
     free, full = (findings.free, findings.full) if findings else (None, None)
-    on_table = findings is None or findings.on_table
+    on_table = findings is None or found.on_table is not None
     other = None if on_table or sensor == "accelerometer" else case.accelerometer
     departures = [text for stage in case.calibration.stages for text in stage.details.departures or ()]
 

@@ -19,14 +19,11 @@ import numpy as np
 from pipeline.core.records import (
     Answer,
     Candidate,
-    Dependence,
     Estimate,
-    MethodError,
     Noise,
     Recording,
     SensorCalibration,
     SensorDiagnosis,
-    TableEvidence,
     Values,
     Wander,
 )
@@ -80,8 +77,7 @@ class Findings:
     """The result of a selection, and the scores of all candidates."""
 
     sensor: str
-    selected: Sequence[str]
-    verdict: Verdict  # by the selection alone
+    diagnosis: SensorDiagnosis  # what the selection itself states; ``diagnosis_of`` adds what follows from the others
     steps: Mapping[str, Score]  # of each selected effect when it was accepted
     alone: Mapping[str, Score]  # of each candidate given base and configured effects
     terms: Sequence[EffectColumns]  # configured and selected effects with their fitted values
@@ -94,19 +90,10 @@ class Findings:
     excess: float  # of the first of these over the noise
     held_out: Sequence[float | None]  # held-out rms error, of the same fits as ``squares``
     harmful: Mapping[str, str]  # selected effects that raise it significantly, with the reason
-    hidden: Mapping[str, str]  # reason why an effect is not observable
-    unknown: Sequence[Dependence]
-    over_noise: float | None  # rms residual of the base over the noise
-    left_over_noise: float | None  # the same with the selected effects
-    wander: Wander
+    left_over_noise: float | None  # rms residual with the selected effects over the noise
     advice: Callable[[Verdict], str]  # what to record next if no effect was selected, by the verdict
     free: Callable[[], SensorCalibration] | None = None  # by a free fit of the same recordings
     full: Callable[[], SensorCalibration] | None = None  # the same with the selected effects, if there are any
-    on_table: bool = True
-    method_errors: Sequence[MethodError] = ()
-    suggested_effect: Mapping[str, Any] | None = None  # content of an effect file
-    table_evidence: TableEvidence | None = None
-    details: Mapping[str, Any] = field(default_factory=dict)  # further entries of the document
     turns: Mapping[str, str] = field(default_factory=dict)  # recordings for which effects of turns have parameters
     search: Callable[[], Findings | None] | None = None  # for a formula outside the catalogue; returns None without one
     deeper: Callable[[], dict[str, Any]] | None = None  # further entries of the document if something is missing
@@ -114,34 +101,25 @@ class Findings:
 
 def diagnosis_of(findings: Findings, case: DiagnosisInput) -> SensorDiagnosis:
     """Return the diagnosis of a sensor, with the verdict by the selection alone."""
+    found, answers = findings.diagnosis, findings.answers
     listed = [name for name in case.configured if name in case.settings.effects.of(case.sensor)]
     others = sorted(findings.alone.values(), key=lambda score: -score.delta_bic)
-    unselected = [s.name for s in others if s.name not in findings.selected and s.name not in findings.hidden]
-    ranking = [_entry(findings, name) for name in (*findings.selected, *unselected)]
-    shows_nothing = findings.verdict == Verdict.NOTHING_MISSING and not ranking and findings.hidden
-    verdict = Verdict.NOT_ENOUGH_DATA if shows_nothing else findings.verdict
-    override = f"effects.{case.sensor}=[{','.join([*listed, *findings.selected])}]"
-    answers = findings.answers
+    unselected = [s.name for s in others if s.name not in found.selected and s.name not in found.not_observable]
+    ranking = [_entry(findings, name) for name in (*found.selected, *unselected)]
+    shows_nothing = found.verdict == Verdict.NOTHING_MISSING and not ranking and found.not_observable
+    verdict = Verdict.NOT_ENOUGH_DATA if shows_nothing else found.verdict
+    override = f"effects.{case.sensor}=[{','.join([*listed, *found.selected])}]"
     sets = [Answer(names, min(p, CERTAIN)) for names, p in answers.answer_set()]
-    return SensorDiagnosis(
+    return replace(
+        found,
         verdict=verdict,
-        configured=case.configured,
-        residual_over_noise=findings.over_noise,
-        selected=findings.selected,
         ranking=ranking,
         probability={name: min(answers.probability(name), CERTAIN) for name in answers.upper_limit},
         answer_set=sets,
         upper_limit=_upper_limits(findings),
-        to_distinguish=to_distinguish(sets, findings.sensor, on_table=findings.on_table),
-        not_observable=findings.hidden,
-        unexplained=findings.unknown,
-        suggested_effect=findings.suggested_effect,
+        to_distinguish=to_distinguish(sets, findings.sensor, on_table=found.on_table is not None),
         next_experiment=next_experiment(verdict, ranking, findings),
-        override=override if findings.selected else "",
-        wander=findings.wander,
-        method_errors=findings.method_errors,
-        on_table=findings.table_evidence,
-        details=findings.details,
+        override=override if found.selected else "",
     )
 
 
@@ -168,10 +146,10 @@ def with_unknown(found: SensorDiagnosis) -> SensorDiagnosis:
 
 def next_experiment(verdict: Verdict, ranking: Sequence[Candidate], findings: Findings) -> str:
     """Return the most informative next experiment as one sentence."""
-    on_table = findings.on_table
+    found, on_table = findings.diagnosis, findings.diagnosis.on_table is not None
     if verdict == Verdict.UNEXPLAINED:
-        return of_unknown(findings.unknown, on_table=on_table) if findings.unknown else findings.advice(verdict)
-    if not findings.selected:
+        return of_unknown(found.unexplained, on_table=on_table) if found.unexplained else findings.advice(verdict)
+    if not found.selected:
         if verdict == Verdict.NOTHING_MISSING and findings.answers.sets[0][0]:
             pair = findings.answers.sets[0], ((), dict(findings.answers.sets).get((), 0.0))
             sets = [Answer(names, min(p, CERTAIN)) for names, p in pair]
@@ -182,7 +160,7 @@ def next_experiment(verdict: Verdict, ranking: Sequence[Candidate], findings: Fi
     def alike(name: str) -> list[str]:
         return [n for n in entries[name].look_alikes if name not in getattr(catalogue().get(n), "contains", ())]
 
-    name = next((n for n in findings.selected if alike(n)), findings.selected[0])
+    name = next((n for n in found.selected if alike(n)), found.selected[0])
     experiment = experiment_of(name, on_table=on_table)
     others = listed([plain(other) for other in alike(name)[:2]], "or")
     return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
@@ -192,7 +170,7 @@ def _upper_limits(findings: Findings) -> dict[str, dict[str, tuple[float, str]]]
     """Return the upper limits of the parameters of effects that were not selected, with their units."""
     limits = {}
     for name, values in findings.answers.upper_limit.items():
-        if name in findings.selected or name.startswith(OTHER_PREFIX):
+        if name in findings.diagnosis.selected or name.startswith(OTHER_PREFIX):
             continue
         this = effect(name).of_recordings(findings.turns)
         linear = [p for p in this.parameters(findings.sensor) if p.name not in this.nonlinear or this.moves]
@@ -201,9 +179,9 @@ def _upper_limits(findings: Findings) -> dict[str, dict[str, tuple[float, str]]]
 
 
 def _entry(findings: Findings, name: str) -> Candidate:
-    score = findings.steps.get(name) or findings.alone[name]
-    if name in findings.selected:
-        step = findings.selected.index(name)
+    score, selected = findings.steps.get(name) or findings.alone[name], findings.diagnosis.selected
+    if name in selected:
+        step = selected.index(name)
         before, after = findings.held_out[step : step + 2]
         drop = findings.squares[step] - findings.squares[step + 1]
     else:
@@ -229,7 +207,7 @@ def _entry(findings: Findings, name: str) -> Candidate:
 def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Estimate], bool]:
     """Return the parameters of an effect and whether they are plausible: if selected, by the fit of all selected."""
     values, uncertainty, plausible = score.values, score.uncertainty, score.plausible
-    if score.name in findings.selected:
+    if score.name in findings.diagnosis.selected:
         values, uncertainty = estimates(findings.terms, findings.covariance)[score.name]
         if score.name in findings.limits:
             plausible = within(values, uncertainty, findings.limits[score.name])
@@ -240,7 +218,7 @@ def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Estimate], b
 
 def implausible(findings: Findings) -> list[str]:
     """Return the selected effects beyond their limits."""
-    return [name for name in findings.selected if not _estimates(findings, findings.steps[name])[1]]
+    return [name for name in findings.diagnosis.selected if not _estimates(findings, findings.steps[name])[1]]
 
 
 def wander_of(

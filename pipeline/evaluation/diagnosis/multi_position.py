@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError, PipelineError
-from pipeline.core.records import Dependence, Mask, Noise, Recording, SensorCalibration, UnitRecordings
+from pipeline.core.records import Dependence, Mask, Noise, Recording, SensorCalibration, SensorDiagnosis, UnitRecordings
 from pipeline.core.settings import Settings
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.accelerometer import nonlinear_least_squares
@@ -75,7 +75,6 @@ def findings(case: DiagnosisInput) -> Findings:
     chi = [float(np.sum(fitting.project_out(fit.equations, [with_scatter]).residual ** 2)) for fit in selection.fits]
     moving = with_scatter if "slow" in model.rests.kinds else expected  # its accelerations are no missing effect
     over, left_over = (_over_noise(model, selection.fits[k].equations, moving) for k in (0, -1))
-    verdict = verdict_of_selection_by_hand(selection.names, unknown, left_over)
     scores = fitting.log_likelihoods(selection.fits[-1].equations, selection.hypotheses)
     best = selection.hypotheses[int(np.argmax(scores))]
     noises = [(h.bias, score) for h, score in zip(selection.hypotheses, scores.tolist(), strict=True)]
@@ -95,10 +94,27 @@ def findings(case: DiagnosisInput) -> Findings:
         warmth = catalogue()["bias_temperature"]
         return f"to make bias temperature observable: record {warmth.excitation}" if warmth.name in hidden else ""
 
+    added_variable = added_variable_of_rests(selection) if selection.names else None
+    diagnosis = SensorDiagnosis(
+        verdict_of_selection_by_hand(selection.names, unknown, left_over),
+        case.configured,
+        over,
+        selection.names,
+        not_observable=hidden,
+        unexplained=unknown,
+        wander=wander_of(noises, float(np.sqrt(np.mean(model.white**2))), noise, float(best.scatter[0])),
+        method_errors=given_differences(
+            calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings
+        ),
+        details={
+            "pictures": {"added_variable": added_variable, "unexplained": []},
+            "cross_validation": _cross_validation(selection, folds),
+            "open_if_slow": slow_by_hand(selection, hidden),
+        },
+    )
     return Findings(
         sensor=case.sensor,
-        selected=selection.names,
-        verdict=verdict,
+        diagnosis=diagnosis,
         steps=selection.steps,
         alone=selection.first.scores,
         terms=selection.fits[-1].state.terms,
@@ -111,25 +127,9 @@ def findings(case: DiagnosisInput) -> Findings:
         excess=max(chi[0] - (len(selection.fits[0].residual) - selection.fits[0].rank), chi[0] - chi[-1]),
         held_out=held_out.errors,
         harmful=held_out.harmful(selection.names) | _too_few(selection, case),
-        hidden=hidden,
-        unknown=unknown,
-        over_noise=over,
         left_over_noise=left_over,
-        wander=wander_of(noises, float(np.sqrt(np.mean(model.white**2))), noise, float(best.scatter[0])),
         advice=advice,
         full=(lambda: calibrated(selection.fits[-1])) if selection.names else None,
-        on_table=False,
-        method_errors=given_differences(
-            calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings
-        ),
-        details={
-            "pictures": {
-                "added_variable": added_variable_of_rests(selection) if selection.names else None,
-                "unexplained": [],
-            },
-            "cross_validation": _cross_validation(selection, folds),
-            "open_if_slow": slow_by_hand(selection, hidden),
-        },
     )
 
 

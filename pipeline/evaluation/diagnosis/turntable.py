@@ -24,7 +24,15 @@ import numpy as np
 
 from pipeline.core.errors import ConvergenceError
 from pipeline.core.files import JSON
-from pipeline.core.records import BASE_COUNT, Index, SelectionErrors, SensorCalibration, TableEvidence, Values
+from pipeline.core.records import (
+    BASE_COUNT,
+    Index,
+    SelectionErrors,
+    SensorCalibration,
+    SensorDiagnosis,
+    TableEvidence,
+    Values,
+)
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Design, EffectColumns, placed
@@ -187,7 +195,7 @@ def findings(case: DiagnosisInput) -> Findings:
     if second is None or (beyond and second.bic < selection.bic + MIN_DELTA_BIC):
         return found
     _, other = found_by(second, found.harmful)
-    return found if implausible(other) or other.harmful.keys() & {*other.selected} else other
+    return found if implausible(other) or other.harmful.keys() & {*other.diagnosis.selected} else other
 
 
 def _found(selection: Selection, case: DiagnosisInput, harmful: Mapping[str, str]) -> Findings:
@@ -214,7 +222,7 @@ def _found(selection: Selection, case: DiagnosisInput, harmful: Mapping[str, str
 
 
 def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mapping[str, str]) -> Findings:
-    sensor, noise, selection, reported = case.sensor, case.noise, discovery.context, discovery.reported
+    noise, selection, reported = case.noise, discovery.context, discovery.reported
     observations, unknown = selection.observations, discovery.unknown
     fits = fits_of(reported)
     errors, floor, harmful = _held_out(reported, fits, case)
@@ -262,10 +270,26 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
 
     scores = reported.ranking.log_likelihoods(reported.chosen())
     noises = list(zip(reported.ranking.settings, scores.tolist(), strict=True))[1:]  # the first is white noise
+    samples = sum(r.samples for r in case.recordings if r.role in ROLES)
+    diagnosis = SensorDiagnosis(
+        verdict,
+        case.configured,
+        _over_noise(selection.base, case, observations),
+        reported.names,
+        not_observable=not_shown,
+        unexplained=unknown,
+        suggested_effect=discovery.suggested if reason is None else None,
+        method_errors=method_errors(case.calibration, reported, case.recordings, case.settings),
+        wander=wander_of(noises, float(np.sqrt(white_square)), noise),
+        on_table=TableEvidence(held_out, formulas, reason),
+        details={
+            "pictures": plots(selection, unknown, noise, reported),
+            "rows": {"rows": len(observations.weight), "samples": samples},
+        },
+    )
     return Findings(
-        sensor=sensor,
-        selected=reported.names,
-        verdict=verdict,
+        sensor=case.sensor,
+        diagnosis=diagnosis,
         steps=reported.steps,
         alone=reported.alone,
         terms=final.terms,
@@ -278,24 +302,10 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         excess=excess,
         held_out=errors or [None] * len(fits),
         harmful={**known_harmful, **harmful},
-        hidden=not_shown,
-        unknown=unknown,
-        over_noise=_over_noise(selection.base, case, observations),
         left_over_noise=_over_noise(selection.fit, case, observations),
-        wander=wander_of(noises, float(np.sqrt(white_square)), noise),
         advice=advice,
         free=lambda: calibrated(selection.base),
         full=(lambda: calibrated(selection.fit)) if selection.names else None,
-        method_errors=method_errors(case.calibration, reported, case.recordings, case.settings),
-        suggested_effect=discovery.suggested if reason is None else None,
-        table_evidence=TableEvidence(held_out, formulas, reason),
-        details={
-            "pictures": plots(selection, unknown, noise, reported),
-            "rows": {
-                "rows": len(observations.weight),
-                "samples": sum(r.samples for r in case.recordings if r.role in ROLES),
-            },
-        },
         turns=turns_of(observations),
         deeper=lambda: {
             "influence": influence(reported, [*suggested, *reported.names]),
