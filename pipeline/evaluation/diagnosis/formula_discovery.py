@@ -324,30 +324,25 @@ class Forms:
         return distinct + [Form(band) for band in (forms.bands(spans["speed"]) if "speed" in spans else [])]
 
     @cached_property
-    def _powers(self) -> list[tuple[list[tuple[str, tuple[str, ...]]], Values]]:
-        """Return signal and formulas of each polynomial, and the values of all formulas; those of ``u`` are apart."""
-        spans = [(span.signal, span) for span in self._spans.values()]
+    def _powers(self) -> list[tuple[str, tuple[str, ...], Values]]:
+        """Return signal, formulas and their values of each polynomial."""
         u = Span.of(self.selection.observations, "fz" if self.sensor == "accelerometer" else "wz")
-        texts = [[(signal, forms.powers(span, signal)) for signal, span in each] for each in (spans, [("u", u)])]
-        formulas = [[text for _, powers in each for text in powers] for each in texts]
-        values = [self.scan.values(forms.columns_of(each, self.sensor)) for each in formulas]
-        return list(zip(texts, values, strict=True))
+        texts = [(signal, forms.powers(span, signal)) for signal, span in {**self._spans, "u": u}.items()]
+        return [(signal, each, self.scan.values(forms.columns_of(each, self.sensor))) for signal, each in texts]
 
     def _polynomials(self) -> list[ScoredForm]:
         """Return the polynomial of the best order of each signal, without powers that base or effects contain."""
         found = []
-        for signals, values in self._powers:
-            projected, first = ProjectedCurves(self.scan, values), 0
-            for signal, texts in signals:
-                new = projected.independent(range(first, first + len(texts)))
-                drops = projected.drop(new) if new else np.zeros((*self.scan.left.shape, 1))
-                gains = self.scan.best_axes(drops, np.arange(1, drops.shape[2] + 1))
-                best = max(range(len(gains)), key=lambda k: gains[k].delta_bic - PRICE * k)
-                index = [k - first for k in new[: best + 1]]
-                formulas = tuple(texts[k] for k in index)
-                form = forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)
-                found.append(ScoredForm(Form(form), gains[best]))
-                first += len(texts)
+        for signal, texts, values in self._powers:
+            projected = ProjectedCurves(self.scan, values)
+            new = projected.independent(range(len(texts)))
+            drops = projected.drop(new) if new else np.zeros((*self.scan.left.shape, 1))
+            gains = self.scan.best_axes(drops, np.arange(1, drops.shape[2] + 1))
+            best = max(range(len(gains)), key=lambda k: gains[k].delta_bic - PRICE * k)
+            index = new[: best + 1]
+            formulas = tuple(texts[k] for k in index)
+            form = forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)
+            found.append(ScoredForm(Form(form), gains[best]))
         return found
 
 
