@@ -29,8 +29,6 @@ from pipeline.core.records import (
 )
 from pipeline.core.settings import DataSheet, Settings
 from pipeline.core.verdicts import Verdict
-from pipeline.estimation.candidates import estimates
-from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gates import MIN_DELTA_BIC, within
 from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.known_effects import known_effects
@@ -80,8 +78,7 @@ class Findings:
     diagnosis: SensorDiagnosis  # what the selection itself states; ``diagnosis_of`` adds what follows from the others
     steps: Mapping[str, Score]  # of each selected effect when it was accepted
     alone: Mapping[str, Score]  # of each candidate given base and configured effects
-    terms: Sequence[EffectColumns]  # configured and selected effects with their fitted values
-    covariance: Values  # of that fit; the parameters of the effects come last
+    fitted: Mapping[str, tuple[Values, Values]]  # values and uncertainties of configured and selected effects
     limits: Mapping[str, Values]  # of plausibility
     answers: Answers
     shares: Callable[[str], Mapping[str, float]]  # share of an effect's fitted signal that each other one reproduces
@@ -208,7 +205,7 @@ def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Estimate], b
     """Return the parameters of an effect and whether they are plausible: if selected, by the fit of all selected."""
     values, uncertainty, plausible = score.values, score.uncertainty, score.plausible
     if score.name in findings.diagnosis.selected:
-        values, uncertainty = estimates(findings.terms, findings.covariance)[score.name]
+        values, uncertainty = findings.fitted[score.name]
         if score.name in findings.limits:
             plausible = within(values, uncertainty, findings.limits[score.name])
     described = effect(score.name).of_recordings(findings.turns).parameters(findings.sensor)

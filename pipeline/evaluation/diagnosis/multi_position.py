@@ -28,6 +28,7 @@ from pipeline.core.records import Dependence, Mask, Noise, Recording, SensorCali
 from pipeline.core.settings import Settings
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.candidates import estimates
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.effects import model_of
 from pipeline.estimation.engine import ScaledColumns, cholesky
@@ -117,8 +118,7 @@ def findings(case: DiagnosisInput) -> Findings:
         diagnosis=diagnosis,
         steps=selection.steps,
         alone=selection.first.scores,
-        terms=selection.fits[-1].state.terms,
-        covariance=selection.fits[-1].covariance,
+        fitted=estimates(selection.fits[-1].state.terms, selection.fits[-1].covariance),
         limits=selection.limits,
         answers=posterior(selection, never_shown(hidden, selection.names)),
         shares=lambda name: _shares(selection, name),

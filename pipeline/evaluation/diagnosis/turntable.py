@@ -34,7 +34,7 @@ from pipeline.core.records import (
     Values,
 )
 from pipeline.core.verdicts import Verdict
-from pipeline.estimation.candidates import turns_of
+from pipeline.estimation.candidates import estimates, turns_of
 from pipeline.estimation.design import Design, EffectColumns, placed
 from pipeline.estimation.gates import MIN_DELTA_BIC, min_delta_bic
 from pipeline.estimation.generalized_least_squares import JointFit, calibration_of
@@ -292,8 +292,7 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         diagnosis=diagnosis,
         steps=reported.steps,
         alone=reported.alone,
-        terms=final.terms,
-        covariance=final.covariance,
+        fitted=estimates(final.terms, final.covariance),
         limits=reported.limits,
         answers=answers,
         shares=lambda name: _shares(reported, name),
