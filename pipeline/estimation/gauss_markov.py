@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -220,6 +220,7 @@ class Blocks:
     start: Values
     length: Values
     clock: Integers  # (m,); blocks of the same number have a known distance in time
+    _models: dict[tuple[Setting, ...], GaussMarkov] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of_rows(cls, rows: Sequence[tuple[Values, Values]], clocks: Sequence[int], length: float) -> Blocks:
@@ -240,11 +241,6 @@ class Blocks:
     def order(self) -> Index:
         """Return the blocks in the order of time on each clock."""
         return np.lexsort((self.start, self.clock))
-
-    @cached_property
-    def _models(self) -> dict[tuple[Setting, ...], GaussMarkov]:
-        """The results of ``model``."""
-        return {}
 
     def model(self, settings: tuple[Setting, ...]) -> GaussMarkov:
         """Return C of the blocks at some settings; it is factorised once."""

@@ -17,7 +17,7 @@ about the noise, weighted by their restricted likelihood.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
 
@@ -103,6 +103,7 @@ class JointFit(Start):
     converged: bool
     condition: float  # of the scaled products of columns
     rank: int  # parameters, or combinations of them, that the readings determine
+    _designs: dict[Observations, Design] = field(default_factory=dict, init=False, repr=False)  # results of ``design``
 
     @cached_property
     def in_mean_frame(self) -> tuple[JointFit, Values]:
@@ -115,11 +116,6 @@ class JointFit(Start):
         change = errors_in_mean_frame(K, theta, place, len(self.covariance))
         terms = tuple(replace(term, values=theta) if term is mounting else term for term in self.terms)
         return replace(self, K=K, terms=terms, covariance=change @ self.covariance @ change.T), change
-
-    @cached_property
-    def _designs(self) -> dict[Observations, Design]:
-        """The results of ``design``."""
-        return {}
 
     def design(self, observations: Observations) -> Design:
         """Return the design of observations at this solution, with the residual as readings; it is built once."""

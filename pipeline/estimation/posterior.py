@@ -407,7 +407,6 @@ def _worth_a_fit(search: SetSearch, moving: frozenset[str], fitted: frozenset[st
 
 
 def _fit(selection: Selection, names: Collection[str], candidates: Mapping[str, EffectColumns]) -> JointFit:
-    """Fit base, configured effects and a set of others."""
     fitted = {term.effect.name: term for term in selection.fit.terms}
     terms = list(selection.base.terms)
     for name in sorted(names):

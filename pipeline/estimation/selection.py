@@ -349,7 +349,6 @@ class Selection:
         return [fitted.get(n) or replace(self.candidates[n], values=self.steps[n].values) for n in self.names]
 
     def _remove(self, names: Sequence[str]) -> None:
-        """Remove effects from the selected and fitted ones."""
         self.steps = {name: step for name, step in self.steps.items() if name not in names}
         self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name not in names))
 

@@ -262,7 +262,8 @@ def test_an_effect_outside_the_data_sheet_is_implausible_and_far_outside_no_caus
 def test_earth_rotation_is_no_candidate_where_the_place_is_configured() -> None:
     recordings = hidden("gyroscope")
     configured = settings_of(settings("gyroscope"), table={"latitude_deg": 13.7, "azimuth_deg": 0.0})
-    part = diagnose(SensorCalibration("gyroscope"), recordings, None, configured)
+    noise = estimate_noise("gyroscope", recordings, SHEET.gyroscope)
+    part = diagnose(SensorCalibration("gyroscope"), recordings, noise, configured)
     named = {e["effect"] for e in part["ranking"]} | {e["effect"] for e in part["not_observable"]}
     assert "earth_rotation" not in named
 
@@ -356,9 +357,10 @@ def test_units_do_not_change_what_is_selected() -> None:
     scaled = [
         replace(r, accelerometer=None if r.accelerometer is None else 9.80665 * r.accelerometer) for r in recordings
     ]
-    here = diagnose(SensorCalibration("accelerometer"), recordings, None, settings("accelerometer"))
+    here = diagnosed("accelerometer", recordings)
     beyond = settings_of(settings("accelerometer"), **{"sensor.accelerometer.accept_implausible": True})
-    there = diagnose(SensorCalibration("accelerometer"), scaled, None, beyond)
+    noise = estimate_noise("accelerometer", scaled, SHEET.accelerometer)
+    there = diagnose(SensorCalibration("accelerometer"), scaled, noise, beyond)
     assert there["selected"] == here["selected"] == ["quadratic_nonlinearity", "table_tilt"] or there[
         "selected"
     ] == here["selected"] == ["table_tilt", "quadratic_nonlinearity"]

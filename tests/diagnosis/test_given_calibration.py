@@ -107,7 +107,9 @@ def test_the_diagnosis_of_a_gyroscope_by_hand_keeps_the_given_accelerometer() ->
     known = SensorCalibration("accelerometer", hand.bias["accelerometer"], frame @ hand.matrix["accelerometer"])
     gyroscope = SensorCalibration("gyroscope", hand.bias["gyroscope"], frame @ hand.matrix["gyroscope"])
     settings = settings_of(hand.settings, method={"given": {"accelerometer": known.to_json()}})
-    model = _model_of_all_rests(DiagnosisInput(gyroscope, [hand.recording], None, settings, known, []))
+    noise = with_noise([hand.recording], settings).noises["gyroscope"]
+    assert noise is not None
+    model = _model_of_all_rests(DiagnosisInput(gyroscope, [hand.recording], noise, settings, known, []))
     spans = np.split(np.arange(len(hand.still)), np.flatnonzero(np.diff(hand.still.astype(int))) + 1)
     assert hand.recording.accelerometer is not None
     rests = [hand.recording.accelerometer[span].mean(axis=0) for span in spans if hand.still[span[0]]]

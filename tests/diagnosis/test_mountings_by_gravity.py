@@ -47,7 +47,9 @@ def test_a_tilt_that_shifts_no_mounting_is_no_doubt_about_the_gyroscope(tilt_deg
     recordings = [replace(r, table_attitude=None) for r in recordings]
     settings = unit_row([f"sensor={description.sensor}", f"table={description.table}"]).config
     recordings = check_recordings(recordings, settings)
-    by_gravity = mountings_by_gravity(with_noise(recordings, settings), settings)
-    case = DiagnosisInput(SensorCalibration("gyroscope"), recordings, None, settings, by_gravity, ["mounting"])
+    unit = with_noise(recordings, settings)
+    by_gravity, noise = mountings_by_gravity(unit, settings), unit.noises["gyroscope"]
+    assert noise is not None
+    case = DiagnosisInput(SensorCalibration("gyroscope"), recordings, noise, settings, by_gravity, ["mounting"])
     found = _doubts_of_gravity(SensorDiagnosis(Verdict.MISSING_EFFECT, [], selected=["table_tilt"]), case)
     assert bool(found) is doubted

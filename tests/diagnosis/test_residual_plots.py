@@ -121,7 +121,7 @@ def test_a_bin_holds_as_much_wander_as_its_cells_of_time_have_in_common() -> Non
     times = np.array([0.0, 100.0, 900.0])
     blocks = Blocks(np.array([0, 2, 4]), np.full(3, 2.0), times, np.zeros(3), np.array([0, 0, 1]))
     values = np.array([0.0, 1.0, 0.0, 2.0, 0.0, np.nan])
-    bins = Bins.of(values, weight)
+    bins = Bins(values, weight)
     np.testing.assert_allclose(bins.weight, [3.0, 1.0, 1.0])
     together = np.exp(-100.0 / 200.0)
     expected = [(3.0 + 2.0 * together) / 9.0, 1.0, 1.0]  # the third recording has a clock of its own

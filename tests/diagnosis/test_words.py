@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.core.records import SensorDiagnosis, TableEvidence
+from pipeline.core.verdicts import Verdict
 from pipeline.estimation.posterior import Answers
 from pipeline.evaluation.diagnosis.findings import next_experiment
 from pipeline.evaluation.diagnosis.words import PLUS_MINUS, in_words, times_of
@@ -60,14 +62,14 @@ def test_an_answer_more_probable_than_nothing_is_the_headline(
 @pytest.mark.parametrize("on_table", [True, False])
 def test_the_next_experiment_distinguishes_the_most_probable_answer_from_nothing(*, on_table: bool) -> None:
     class Found:
-        sensor, selected = "accelerometer", ()
+        sensor = "accelerometer"
+        diagnosis = SensorDiagnosis(Verdict.NOTHING_MISSING, [], on_table=TableEvidence(None, ()) if on_table else None)
         answers = Answers([(("quadratic_nonlinearity",), 0.6), (("cubic_nonlinearity",), 0.25), ((), 0.15)], {})
 
         @staticmethod
         def advice(_verdict: str) -> str:
             return "to make bias temperature observable"
 
-    Found.on_table = on_table  # type: ignore[attr-defined]
     said = next_experiment("nothing_missing", [], Found())  # type: ignore[arg-type]
     assert said.startswith("to distinguish quadratic nonlinearity (0.6) from nothing (0.15): ")
     assert ("centrifuge" in said) is on_table
@@ -131,8 +133,9 @@ def test_a_tilt_that_is_fixed_is_no_estimate() -> None:
 
 def test_an_effect_that_contains_another_needs_no_distinction() -> None:
     class Found:
-        selected = ("lever_arm",)
-        on_table = True
+        diagnosis = SensorDiagnosis(
+            Verdict.MISSING_EFFECT, [], selected=("lever_arm",), on_table=TableEvidence(None, ())
+        )
 
     (found,) = part("missing_effect", ["lever_arm"], [])["ranking"]
     entries = [candidate("lever_arm", look_alikes={a["effect"]: a["share"] for a in found["look_alikes"]})]

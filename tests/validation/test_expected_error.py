@@ -11,6 +11,7 @@ from unit_settings import settings_of
 
 from pipeline.core.records import Noise, SensorCalibration
 from pipeline.evaluation.held_out.error_breakdown import LinearizedSamples, expected_rms_error
+from pipeline.evaluation.held_out.samples import Samples
 
 UNITS, SAMPLES, INTERVAL = 2000, 300, 0.2
 WHITE, TAU = 0.01, 20.0
@@ -76,7 +77,9 @@ def interval(
     smallest = min(freedom, of_scale)
     found = SensorCalibration("gyroscope", covariance=covariance, degrees_of_freedom=smallest, freedom=each)
     spread = [np.broadcast_to(v**2, (SAMPLES, 3)) for v in (noise.white, noise.wander)]
-    held_out = LinearizedSamples(INTERVAL * np.arange(SAMPLES), *spread, truth, J, SAMPLES, correlated)
+    reference = truth, np.linalg.norm(truth, axis=1)
+    samples = Samples("gyroscope", INTERVAL * np.arange(SAMPLES), *reference, *spread, None, None, None)
+    held_out = LinearizedSamples(replace(samples, correlated_samples=correlated), truth, J, SAMPLES)
     return expected_rms_error(found, [held_out], noise, IDEAL.replaced(sensor=UNROUNDED))
 
 

@@ -69,7 +69,7 @@ from pipeline.evaluation.diagnosis.verdict import (
     may_be_unknown,
 )
 from pipeline.evaluation.diagnosis.words import plain
-from pipeline.evaluation.held_out.error_breakdown import last_step, vector_errors
+from pipeline.evaluation.held_out.error_breakdown import left_out, vector_errors, with_known_effects
 from pipeline.evaluation.held_out.samples import HeldOutCase, Samples, samples_of_motion
 from pipeline.evaluation.held_out.validation import HeldOutError, last_error, static_error
 from pipeline.physics.effects import catalogue, effect, effect_of
@@ -140,7 +140,7 @@ def _contradiction(entry: Candidate, case: DiagnosisInput) -> str:
             return f"the temperature changes by {span:.2g} degC, less than its resolution of {resolution:.2g} degC"
     used = [r for r in case.recordings if r.reading(case.sensor) is not None]
     noise = case.noise
-    if sheet.stated("noise_density") is not None and noise is not None and noise.step is None and used:
+    if sheet.stated("noise_density") is not None and noise.step is None and used:
         own = noise.source == "static" or (noise.source == "rests" and is_multi_position(case.sensor, case.recordings))
         excess = float(np.min(noise.white)) / sheet.white(used[0].interval) if own else 0.0
         if excess > TIMES_POSSIBLE:
@@ -169,7 +169,7 @@ def _temperatures(recordings: list[Recording]) -> tuple[float, float]:
 def diagnose(
     calibration: SensorCalibration,
     recordings: Sequence[Recording],
-    noise: Noise | None,
+    noise: Noise,
     settings: Settings,
     accelerometer: SensorCalibration | None = None,
     *,
@@ -261,19 +261,20 @@ def evidence_of(
     """
     sensor, recordings, settings, fit = case.sensor, case.recordings, case.settings, last_fit(case.calibration)
     free, full = (findings.free, findings.full) if findings else (None, None)
+    on_table = findings is None or found.on_table is not None
+    other = None if on_table or sensor == "accelerometer" else case.accelerometer
+    departures = [text for stage in case.calibration.stages for text in stage.details.departures or ()]
 
     def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOutError | None:
-        if fit is None or case.noise is None or findings is None:
+        if fit is None:
             return None
         try:
-            held_out = HeldOutCase(fit(), recordings, case.noise, settings, findings.other)
+            held_out = HeldOutCase(fit(), recordings, case.noise, settings, other)
             return last_error(held_out, held_out.held_out_samples(smoothed=smoothed))
         except ConvergenceError:  # the fit's effects cannot be subtracted from the held-out readings
             return None
 
-    static = None
-    if case.noise is not None:
-        static = static_error(HeldOutCase(case.calibration, recordings, case.noise, settings, case.accelerometer))
+    static = static_error(HeldOutCase(case.calibration, recordings, case.noise, settings, case.accelerometer))
     accepted = settings.sensor.of(sensor).accept_implausible
     published = held_out_of(validation) if validation else error_of(free, smoothed=False)
     contradicted = published is not None and published.above
@@ -291,7 +292,7 @@ def evidence_of(
         full=error_of(full, smoothed=True) if contradicted else None,
         doubts=[
             *doubts_of(sensor, recordings, seats=not _seats_explained(found, sensor, findings)),
-            *(findings.departures if findings else ()),
+            *(departures if findings else ()),
         ],
         approximations=[error.name for error in found.method_errors if error.name in ERRORS_OUTSIDE_UNCERTAINTY],
         unknown=[entry.covariate for entry in found.unexplained if not entry.explained_by],
@@ -308,7 +309,7 @@ def evidence_of(
         filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
         likely=found.answer_set[0].effects if found.answer_set and all(a.effects for a in found.answer_set) else (),
         held_by_limit=not_determined(case.calibration.to_json()) if settings.procedure.sheet or not fit.free else "",
-        on_table=findings is None or findings.on_table,
+        on_table=on_table,
     )
 
 
@@ -414,20 +415,20 @@ def effective_noise(
     held_out = [r for r in recordings if r.role == "validation"]
     of_motion = ((r, samples_of_motion(calibration.sensor, r, noise, table, other=other)) for r in held_out)
     samples = [(r, s) for r, s in of_motion if s is not None]
-    last = [(r, s, last_step(calibration, s)) for r, s in samples]
-    errors = [(r, (s.time, vector_errors([e], directed=e[2] is not None))) for r, s, e in last if e is not None]
-    if not errors:
+    used = [(r, s) for r, s in samples if not left_out(calibration, [s])]
+    if not used:
         return None
+    errors = [_about_mean(s.time, vector_errors([with_known_effects(calibration, s)], directed=True)) for _, s in used]
     of_effects = {}
     for name in found.selected:
         of_effect = [(s.time, _of_effect(calibration, s, found, name)) for _, s in samples]
         if all(error is not None for _, error in of_effect):
             of_effects[name] = [_about_mean(*error) for error in of_effect]
-    interval, of_all = errors[0][0].interval, [_about_mean(*error) for _, error in errors]
+    interval = used[0][0].interval
     white = float(np.sqrt(np.mean(noise.white**2) * interval))
     densities = []
     for time in dict.fromkeys(max(1, round(t / interval)) * interval for t in AVERAGING_TIMES_S):  # whole samples
-        density = _density(of_all, time)
+        density = _density(errors, time)
         if density is None:
             continue
         shares = [{"effect": name, "density": _density(parts, time)} for name, parts in of_effects.items()]
@@ -436,9 +437,8 @@ def effective_noise(
         densities.append(entry)
     if not densities:
         return None
-    used = [r for r, _ in errors]
-    about = {"unit": f"{unit_of(calibration.sensor)}/sqrt(Hz)", "recordings": [r.name for r in used]}
-    return about | {"motion": _motion(used), "white": white, "densities": densities}
+    about = {"unit": f"{unit_of(calibration.sensor)}/sqrt(Hz)", "recordings": [r.name for r, _ in used]}
+    return about | {"motion": _motion([r for r, _ in used]), "white": white, "densities": densities}
 
 
 def _of_effect(calibration: SensorCalibration, samples: Samples, found: SensorDiagnosis, name: str) -> Values | None:

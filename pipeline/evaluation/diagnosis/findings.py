@@ -14,31 +14,27 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from pipeline.core.records import (
     Answer,
     Candidate,
-    Dependence,
     Estimate,
-    MethodError,
     Noise,
     Recording,
     SensorCalibration,
     SensorDiagnosis,
-    TableEvidence,
     Values,
     Wander,
 )
 from pipeline.core.settings import DataSheet, Settings
 from pipeline.core.verdicts import Verdict
-from pipeline.estimation.candidates import estimates
-from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.gates import MIN_DELTA_BIC, within
 from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.known_effects import known_effects
 from pipeline.estimation.posterior import CERTAIN, Answers
 from pipeline.estimation.ranking import Score
 from pipeline.estimation.selection import EVIDENCE, INFLATED, LOOK_ALIKE_SHARE
-from pipeline.evaluation.diagnosis.verdict import if_observable
 from pipeline.evaluation.diagnosis.words import experiment_of, listed, of_unknown, plain, to_distinguish
 from pipeline.physics.effects import catalogue, effect
 from pipeline.physics.effects.equations import OTHER_PREFIX
@@ -53,7 +49,7 @@ class DiagnosisInput:
 
     calibration: SensorCalibration
     recordings: Sequence[Recording]
-    noise: Noise | None
+    noise: Noise
     settings: Settings
     accelerometer: SensorCalibration | None
     configured: list[str]  # effects in the model: those that the settings list, and those of the bench
@@ -79,12 +75,10 @@ class Findings:
     """The result of a selection, and the scores of all candidates."""
 
     sensor: str
-    selected: Sequence[str]
-    verdict: Verdict  # by the selection alone
+    diagnosis: SensorDiagnosis  # what the selection itself states; ``diagnosis_of`` adds what follows from the others
     steps: Mapping[str, Score]  # of each selected effect when it was accepted
     alone: Mapping[str, Score]  # of each candidate given base and configured effects
-    terms: Sequence[EffectColumns]  # configured and selected effects with their fitted values
-    covariance: Values  # of that fit; the parameters of the effects come last
+    fitted: Mapping[str, tuple[Values, Values]]  # values and uncertainties of configured and selected effects
     limits: Mapping[str, Values]  # of plausibility
     answers: Answers
     shares: Callable[[str], Mapping[str, float]]  # share of an effect's fitted signal that each other one reproduces
@@ -93,24 +87,10 @@ class Findings:
     excess: float  # of the first of these over the noise
     held_out: Sequence[float | None]  # held-out rms error, of the same fits as ``squares``
     harmful: Mapping[str, str]  # selected effects that raise it significantly, with the reason
-    hidden: Mapping[str, str]  # reason why an effect is not observable
-    unknown: Sequence[Dependence]
-    over_noise: float | None  # rms residual of the base over the noise
-    left_over_noise: float | None  # the same with the selected effects
-    noises: Sequence[tuple[Setting, float]]  # noise settings and log L
-    white: float  # noise, unit of the sensor
-    expected_wander: float | None
+    left_over_noise: float | None  # rms residual with the selected effects over the noise
     advice: Callable[[Verdict], str]  # what to record next if no effect was selected, by the verdict
     free: Callable[[], SensorCalibration] | None = None  # by a free fit of the same recordings
     full: Callable[[], SensorCalibration] | None = None  # the same with the selected effects, if there are any
-    other: SensorCalibration | None = None  # of the other sensor
-    on_table: bool = True
-    departures: Sequence[str] = ()  # differences of faces and turns by hand from those that are stated
-    scatter_over_noise: float | None = None  # of the rests
-    method_errors: Sequence[MethodError] = ()
-    suggested_effect: Mapping[str, Any] | None = None  # content of an effect file
-    table_evidence: TableEvidence | None = None
-    details: Mapping[str, Any] = field(default_factory=dict)  # further entries of the document
     turns: Mapping[str, str] = field(default_factory=dict)  # recordings for which effects of turns have parameters
     search: Callable[[], Findings | None] | None = None  # for a formula outside the catalogue; returns None without one
     deeper: Callable[[], dict[str, Any]] | None = None  # further entries of the document if something is missing
@@ -118,33 +98,25 @@ class Findings:
 
 def diagnosis_of(findings: Findings, case: DiagnosisInput) -> SensorDiagnosis:
     """Return the diagnosis of a sensor, with the verdict by the selection alone."""
+    found, answers = findings.diagnosis, findings.answers
     listed = [name for name in case.configured if name in case.settings.effects.of(case.sensor)]
     others = sorted(findings.alone.values(), key=lambda score: -score.delta_bic)
-    unselected = [s.name for s in others if s.name not in findings.selected and s.name not in findings.hidden]
-    ranking = [_entry(findings, name) for name in (*findings.selected, *unselected)]
-    verdict = if_observable(findings.verdict, ranking, findings.hidden)
-    override = f"effects.{case.sensor}=[{','.join([*listed, *findings.selected])}]"
-    answers = findings.answers
+    unselected = [s.name for s in others if s.name not in found.selected and s.name not in found.not_observable]
+    ranking = [_entry(findings, name) for name in (*found.selected, *unselected)]
+    shows_nothing = found.verdict == Verdict.NOTHING_MISSING and not ranking and found.not_observable
+    verdict = Verdict.NOT_ENOUGH_DATA if shows_nothing else found.verdict
+    override = f"effects.{case.sensor}=[{','.join([*listed, *found.selected])}]"
     sets = [Answer(names, min(p, CERTAIN)) for names, p in answers.answer_set()]
-    return SensorDiagnosis(
+    return replace(
+        found,
         verdict=verdict,
-        configured=case.configured,
-        residual_over_noise=findings.over_noise,
-        selected=findings.selected,
         ranking=ranking,
         probability={name: min(answers.probability(name), CERTAIN) for name in answers.upper_limit},
         answer_set=sets,
         upper_limit=_upper_limits(findings),
-        to_distinguish=to_distinguish(sets, findings.sensor, on_table=findings.on_table),
-        not_observable=findings.hidden,
-        unexplained=findings.unknown,
-        suggested_effect=findings.suggested_effect,
+        to_distinguish=to_distinguish(sets, findings.sensor, on_table=found.on_table is not None),
         next_experiment=next_experiment(verdict, ranking, findings),
-        override=override if findings.selected else "",
-        wander=_wander(findings),
-        method_errors=findings.method_errors,
-        on_table=findings.table_evidence,
-        details=findings.details,
+        override=override if found.selected else "",
     )
 
 
@@ -171,10 +143,10 @@ def with_unknown(found: SensorDiagnosis) -> SensorDiagnosis:
 
 def next_experiment(verdict: Verdict, ranking: Sequence[Candidate], findings: Findings) -> str:
     """Return the most informative next experiment as one sentence."""
-    on_table = findings.on_table
+    found, on_table = findings.diagnosis, findings.diagnosis.on_table is not None
     if verdict == Verdict.UNEXPLAINED:
-        return of_unknown(findings.unknown, on_table=on_table) if findings.unknown else findings.advice(verdict)
-    if not findings.selected:
+        return of_unknown(found.unexplained, on_table=on_table) if found.unexplained else findings.advice(verdict)
+    if not found.selected:
         if verdict == Verdict.NOTHING_MISSING and findings.answers.sets[0][0]:
             pair = findings.answers.sets[0], ((), dict(findings.answers.sets).get((), 0.0))
             sets = [Answer(names, min(p, CERTAIN)) for names, p in pair]
@@ -185,7 +157,7 @@ def next_experiment(verdict: Verdict, ranking: Sequence[Candidate], findings: Fi
     def alike(name: str) -> list[str]:
         return [n for n in entries[name].look_alikes if name not in getattr(catalogue().get(n), "contains", ())]
 
-    name = next((n for n in findings.selected if alike(n)), findings.selected[0])
+    name = next((n for n in found.selected if alike(n)), found.selected[0])
     experiment = experiment_of(name, on_table=on_table)
     others = listed([plain(other) for other in alike(name)[:2]], "or")
     return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
@@ -195,7 +167,7 @@ def _upper_limits(findings: Findings) -> dict[str, dict[str, tuple[float, str]]]
     """Return the upper limits of the parameters of effects that were not selected, with their units."""
     limits = {}
     for name, values in findings.answers.upper_limit.items():
-        if name in findings.selected or name.startswith(OTHER_PREFIX):
+        if name in findings.diagnosis.selected or name.startswith(OTHER_PREFIX):
             continue
         this = effect(name).of_recordings(findings.turns)
         linear = [p for p in this.parameters(findings.sensor) if p.name not in this.nonlinear or this.moves]
@@ -204,9 +176,9 @@ def _upper_limits(findings: Findings) -> dict[str, dict[str, tuple[float, str]]]
 
 
 def _entry(findings: Findings, name: str) -> Candidate:
-    score = findings.steps.get(name) or findings.alone[name]
-    if name in findings.selected:
-        step = findings.selected.index(name)
+    score, selected = findings.steps.get(name) or findings.alone[name], findings.diagnosis.selected
+    if name in selected:
+        step = selected.index(name)
         before, after = findings.held_out[step : step + 2]
         drop = findings.squares[step] - findings.squares[step + 1]
     else:
@@ -232,8 +204,8 @@ def _entry(findings: Findings, name: str) -> Candidate:
 def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Estimate], bool]:
     """Return the parameters of an effect and whether they are plausible: if selected, by the fit of all selected."""
     values, uncertainty, plausible = score.values, score.uncertainty, score.plausible
-    if score.name in findings.selected:
-        values, uncertainty = estimates(findings.terms, findings.covariance)[score.name]
+    if score.name in findings.diagnosis.selected:
+        values, uncertainty = findings.fitted[score.name]
         if score.name in findings.limits:
             plausible = within(values, uncertainty, findings.limits[score.name])
     described = effect(score.name).of_recordings(findings.turns).parameters(findings.sensor)
@@ -243,22 +215,26 @@ def _estimates(findings: Findings, score: Score) -> tuple[dict[str, Estimate], b
 
 def implausible(findings: Findings) -> list[str]:
     """Return the selected effects beyond their limits."""
-    return [name for name in findings.selected if not _estimates(findings, findings.steps[name])[1]]
+    return [name for name in findings.diagnosis.selected if not _estimates(findings, findings.steps[name])[1]]
 
 
-def _wander(findings: Findings) -> Wander:
-    """Return the most likely wander, given base, configured and selected effects, and whether it is inflated."""
-    wander, best = max(findings.noises, key=lambda noise: noise[1])
-    inflated = False
-    if findings.expected_wander is not None:
-        limit = INFLATED * max(findings.expected_wander / findings.white, LEAST_RATIO)
-        believed = [score for setting, score in findings.noises if setting.ratio <= limit]
-        inflated = wander.ratio > limit and (not believed or best - max(believed) > EVIDENCE)
+def wander_of(
+    noises: Sequence[tuple[Setting, float]], white: float, noise: Noise, scatter: float | None = None
+) -> Wander:
+    """Return the most likely wander, given base, configured and selected effects, and whether it is inflated.
+
+    ``noises``: settings and log L. ``white``: unit of the sensor. ``noise``: as expected. ``scatter``: that of rests by
+    hand, over the noise.
+    """
+    wander, best = max(noises, key=lambda each: each[1])
+    expected = float(np.sqrt(np.mean(noise.wander**2)))
+    limit = INFLATED * max(expected / white, LEAST_RATIO)
+    believed = [score for setting, score in noises if setting.ratio <= limit]
     return Wander(
         ratio=float(wander.ratio),
         time_s=float(wander.time) if wander.ratio else None,
-        standard_deviation=float(wander.ratio * findings.white),
-        expected=findings.expected_wander,
-        inflated=bool(inflated),
-        scatter_over_noise=findings.scatter_over_noise,
+        standard_deviation=float(wander.ratio * white),
+        expected=expected,
+        inflated=bool(wander.ratio > limit and (not believed or best - max(believed) > EVIDENCE)),
+        scatter_over_noise=scatter,
     )

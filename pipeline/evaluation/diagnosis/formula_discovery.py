@@ -37,6 +37,7 @@ from pipeline.estimation.gates import MAX_MIN_DELTA_BIC, MIN_DELTA_BIC
 from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import Observations, without_each_recording, without_rows
+from pipeline.estimation.ranking import by_size
 from pipeline.estimation.selection import FAR_ABOVE, Selection, select
 from pipeline.evaluation.diagnosis import functional_forms as forms
 from pipeline.evaluation.diagnosis.findings import DiagnosisInput
@@ -111,23 +112,16 @@ class FormProducts:
             return known[key]
 
         known: dict[tuple[int, tuple[str, ...], tuple[str, ...]], list[list[int]]] = {}
-        alike: dict[tuple[int, int], list[int]] = {}  # forms whose columns have the same shape
         pairs = []  # places of both kinds on each axis
-        for k, form in enumerate(tried):
-            alike.setdefault((len(form.factor.texts), 3 if "u" in form.signals else 1), []).append(k)
+        for form in tried:
             modulator = places(1, form.modulator) if apart and form.modulator else [[0]] * 3
             pairs.append((places(0, form.factor, None if apart else form.modulator), modulator))
-        self.alike = [
-            (
-                r,
-                members,
-                [
-                    [np.array([each[axis] for each in kind]) for kind in zip(*(pairs[k] for k in members), strict=True)]
-                    for axis in range(axes)
-                ],
-            )
-            for (r, axes), members in alike.items()
-        ]
+        # of forms whose columns have the same shape: number of columns, which forms, and their places on each axis
+        self.alike: list[tuple[int, list[int], list[tuple[Index, Index]]]] = []
+        for members in by_size((len(form.factor.texts), "u" in form.signals) for form in tried):
+            first, axes = tried[members[0]], range(3 if "u" in tried[members[0]].signals else 1)
+            f, m = (np.array(each) for each in zip(*(pairs[k] for k in members), strict=True))
+            self.alike.append((len(first.factor.texts), members, [(f[:, axis], m[:, axis]) for axis in axes]))
         F, G = self.columns = [np.stack(known, axis=1) for known in kinds]
         weighted, edges = scan.weight[:, None] * G, [*scan.blocks.first.tolist(), len(F)]
         sums = np.stack([F[at].T @ weighted[at] for at in starmap(slice, pairwise(edges))])
@@ -218,10 +212,11 @@ class Forms:
         ``factor``: whose formula it is.
         """
         if text not in self._columns:
-            of_signal = factor.values(self.column(factor.signal)) if factor and factor.constants else None
-            if of_signal is None:
-                of_signal = np.concatenate([forms.values_of(parse(text), signals) for signals in self._signals])
-            self._columns[text] = of_signal
+            if factor and factor.constants:
+                self._columns[text] = factor.values(self.column(factor.signal))
+            else:
+                of_parts = [forms.values_of(parse(text), signals) for signals in self._signals]
+                self._columns[text] = np.concatenate(of_parts)
         return self._columns[text]
 
     def gains(self, tried: Sequence[Form]) -> list[FormGain]:
@@ -329,30 +324,25 @@ class Forms:
         return distinct + [Form(band) for band in (forms.bands(spans["speed"]) if "speed" in spans else [])]
 
     @cached_property
-    def _powers(self) -> list[tuple[list[tuple[str, tuple[str, ...]]], Values]]:
-        """Return signal and formulas of each polynomial, and the values of all formulas; those of ``u`` are apart."""
-        spans = [(span.signal, span) for span in self._spans.values()]
+    def _powers(self) -> list[tuple[str, tuple[str, ...], Values]]:
+        """Return signal, formulas and their values of each polynomial."""
         u = Span.of(self.selection.observations, "fz" if self.sensor == "accelerometer" else "wz")
-        texts = [[(signal, forms.powers(span, signal)) for signal, span in each] for each in (spans, [("u", u)])]
-        formulas = [[text for _, powers in each for text in powers] for each in texts]
-        values = [self.scan.values(forms.columns_of(each, self.sensor)) for each in formulas]
-        return list(zip(texts, values, strict=True))
+        texts = [(signal, forms.powers(span, signal)) for signal, span in {**self._spans, "u": u}.items()]
+        return [(signal, each, self.scan.values(forms.columns_of(each, self.sensor))) for signal, each in texts]
 
     def _polynomials(self) -> list[ScoredForm]:
         """Return the polynomial of the best order of each signal, without powers that base or effects contain."""
         found = []
-        for signals, values in self._powers:
-            projected, first = ProjectedCurves(self.scan, values), 0
-            for signal, texts in signals:
-                new = projected.independent(range(first, first + len(texts)))
-                drops = projected.drop(new) if new else np.zeros((*self.scan.left.shape, 1))
-                gains = self.scan.best_axes(drops, np.arange(1, drops.shape[2] + 1))
-                best = max(range(len(gains)), key=lambda k: gains[k].delta_bic - PRICE * k)
-                index = [k - first for k in new[: best + 1]]
-                formulas = tuple(texts[k] for k in index)
-                form = forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)
-                found.append(ScoredForm(Form(form), gains[best]))
-                first += len(texts)
+        for signal, texts, values in self._powers:
+            projected = ProjectedCurves(self.scan, values)
+            new = projected.independent(range(len(texts)))
+            drops = projected.drop(new) if new else np.zeros((*self.scan.left.shape, 1))
+            gains = self.scan.best_axes(drops, np.arange(1, drops.shape[2] + 1))
+            best = max(range(len(gains)), key=lambda k: gains[k].delta_bic - PRICE * k)
+            index = new[: best + 1]
+            formulas = tuple(texts[k] for k in index)
+            form = forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)
+            found.append(ScoredForm(Form(form), gains[best]))
         return found
 
 
@@ -410,7 +400,7 @@ def discover(selection: Selection, unknown: Sequence[Dependence], case: Diagnosi
     noise: then something else is missing. None is searched where that is certain before (``Forms.may_leave``).
     """
     noise = case.noise
-    floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
+    floor = float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
     best, least = Discovery(selection, selection, unknown), _criterion(selection, []) + MIN_DELTA_BIC
     alone, grammar = replace(selection, steps={}, fit=selection.base), None
     tried: list[tuple[Sequence[str], Sequence[str]]] = []

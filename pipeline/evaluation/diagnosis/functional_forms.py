@@ -22,6 +22,7 @@ import numpy as np
 
 from pipeline.core.records import Motion, Values
 from pipeline.estimation.observations import Observations
+from pipeline.estimation.ranking import by_size
 from pipeline.physics.effects.base import truth, unit_of
 from pipeline.physics.effects.equations import CURVE_DEGREE
 from pipeline.physics.formula import Formula, parse
@@ -85,33 +86,19 @@ def available_signals(observations: Observations) -> list[str]:
     return names + (["time"] if observations.clock_shared else [])
 
 
-@dataclass(frozen=True)
 class Span:
-    """The sorted values of a signal in all rows."""
+    """The sorted values of a signal in all rows, the smallest and the largest, and the difference of these."""
 
-    signal: str
-    values: Values
+    def __init__(self, signal: str, values: Values) -> None:
+        self.signal, self.values = signal, np.sort(values)
+        self.low, self.high = float(self.values[0]), float(self.values[-1])
+        self.size = max(self.high - self.low, 1e-12)
 
     @classmethod
     def of(cls, observations: Observations, signal: str) -> Span:
         """Return the span of a signal."""
         known = (signals_of(part.motion, observations.sensor) for part in observations.parts)
-        return cls(signal, np.sort(np.concatenate([each[signal][:, 0] for each in known if signal in each])))
-
-    @property
-    def low(self) -> float:
-        """Smallest value."""
-        return float(self.values[0])
-
-    @property
-    def high(self) -> float:
-        """Largest value."""
-        return float(self.values[-1])
-
-    @property
-    def size(self) -> float:
-        """Largest less smallest value."""
-        return max(self.high - self.low, 1e-12)
+        return cls(signal, np.concatenate([each[signal][:, 0] for each in known if signal in each]))
 
     def places(self) -> Values:
         """Return the places of steps in the coarse scan: evenly over the span, or between constant speeds."""
@@ -141,18 +128,16 @@ class Factor:
     constants: tuple[float, ...] = ()  # scanned
     origin: float = 0.0  # of the signal in an exponential
 
-    def values(self, signal: Values) -> Values | None:
-        """Return the values of a factor with constants without parsing its formula; None for other factors."""
+    def values(self, signal: Values) -> Values:
+        """Return the values of a factor with constants, without parsing its formula."""
         if self.kind == "band":
             low, high = (float(f"{place:.5g}") for place in self.constants)
             return np.logical_and(signal >= low, signal <= high).astype(float)
         if self.kind == "step":
             above, widths = signal - float(f"{self.constants[0]:.7g}"), self.constants[1:]
             return 0.5 * (1.0 + np.tanh(above / float(f"{widths[0]:.3g}"))) if widths else np.heaviside(above, 1.0)
-        if self.kind in ("exponential", "growth"):
-            sign = 1.0 if self.kind == "growth" else -1.0
-            return np.asarray(np.exp(sign * (signal - self.origin) / self.constants[0]))
-        return None
+        sign = 1.0 if self.kind == "growth" else -1.0
+        return np.asarray(np.exp(sign * (signal - self.origin) / self.constants[0]))
 
 
 @dataclass(frozen=True)
@@ -225,8 +210,7 @@ class Form:
 def digests(values: Sequence[Values]) -> list[bytes]:
     """Return the same bytes for forms whose values differ by a factor alone."""
     found: dict[int, bytes] = {}
-    for number in {each.size for each in values}:
-        index = [k for k, each in enumerate(values) if each.size == number]
+    for index in by_size(each.size for each in values):
         flat = np.stack([values[k].ravel() for k in index])
         size = np.linalg.norm(flat, axis=1, keepdims=True)
         first = np.take_along_axis(flat, np.argmax(np.abs(flat) > 1e-6 * size, axis=1)[:, None], axis=1)

@@ -16,7 +16,7 @@ If an effect is missing, bias and sides are not compared, since the effect shift
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -66,14 +66,14 @@ def method_errors(
     if more:
         free = fit_terms(selection.observations, [*free.terms, *more], free, selection.settings)
     of_free = free.covariance, np.kron(calibration.matrix, np.eye(3))
-    difference = _Difference.of(calibration, free.bias, free.K, of_free, settings)
+    difference = _Difference(calibration, free.bias, free.K, of_free, settings)
     of_roles = ([r for r in recordings if r.role == role] for role in (calibration.sensor, "validation"))
     of_turns, of_held_out = (_errors(difference, free, each, settings.table) for each in of_roles)
     shares = {
-        "held_out_share": _shares({name: _rms(error) for name, (error, _) in of_held_out.items()}),
-        "held_out_magnitude_share": _shares({name: _rms(error) for name, (_, error) in of_held_out.items()}),
+        "held_out_share": _shares({name: of_vector for name, (of_vector, _) in of_held_out.items()}),
+        "held_out_magnitude_share": _shares({name: of_size for name, (_, of_size) in of_held_out.items()}),
     }
-    rms = {name: _rms(error) for name, (error, _) in of_turns.items()}
+    rms = {name: of_vector for name, (of_vector, _) in of_turns.items()}
     return _named(difference, rms, recordings, selection.names, shares, printed=settings.method.as_printed)
 
 
@@ -93,7 +93,7 @@ def given_differences(
     free = free_fit()
     K = np.asarray(np.linalg.inv(free.matrix), np.float64)
     of_free = free.covariance, np.kron(calibration.matrix @ K, K.T)
-    difference = _Difference.of(calibration, free.bias, K, of_free, settings)
+    difference = _Difference(calibration, free.bias, K, of_free, settings)
     del difference.matrices["rotation"]
     rates = [np.sum(w**2, axis=1) for r in recordings if (w := r.reading("gyroscope")) is not None]
     size = 1.0 if calibration.sensor == "accelerometer" else float(np.sqrt(np.nanmean(np.concatenate(rates))))
@@ -102,21 +102,15 @@ def given_differences(
     return _named(difference, rms, recordings)
 
 
-@dataclass(frozen=True)
 class _Difference:
-    method: SensorCalibration
-    bias: Values  # (3,): M (b - b_m)
-    matrices: dict[str, Values]  # (3, 3) parts of E
-    uncertainty: Values  # (12,), of bias and E
+    """The difference of a method's calibration from a free fit, of bias b and matrix K.
 
-    @classmethod
-    def of(
-        cls, method: SensorCalibration, bias: Values, K: Values, of_free: tuple[Values | None, Any], settings: Settings
-    ) -> _Difference:
-        """Return the difference from a free fit.
+    ``of_free``: covariance of the free fit's bias and matrix, and (9, 9) derivative of E to this matrix.
+    """
 
-        ``of_free``: covariance of the free fit's bias and matrix, and (9, 9) derivative of E to this matrix.
-        """
+    def __init__(
+        self, method: SensorCalibration, b: Values, K: Values, of_free: tuple[Values | None, Any], settings: Settings
+    ) -> None:
         M, variance = method.matrix, np.zeros(BASE_COUNT)
         for covariance, derivative in (of_free, (_covariance(method, settings), np.kron(np.eye(3), K.T))):
             if covariance is not None:
@@ -125,7 +119,9 @@ class _Difference:
         E = M @ K - np.eye(3)
         diagonal = np.diag(np.diag(E))
         parts = {"scale_factor": diagonal, "non_orthogonality": 0.5 * (E + E.T) - diagonal, "rotation": 0.5 * (E - E.T)}
-        return cls(method, M @ (bias - method.bias), parts, np.sqrt(np.clip(variance, 0.0, None)))
+        self.method, self.bias = method, M @ (b - method.bias)
+        self.matrices: dict[str, Values] = parts
+        self.uncertainty = np.sqrt(np.clip(variance, 0.0, None))  # (12,), of bias and E
 
     def errors(self, motion: Motion, free: JointFit) -> dict[str, Values]:
         """Return the error of the calibrated reading by cause, without that of the filter: (n, 3) arrays."""
@@ -165,8 +161,8 @@ def _covariance(calibration: SensorCalibration, settings: Settings) -> Values:
 
 def _errors(
     difference: _Difference, free: JointFit, recordings: Sequence[Recording], table: Table
-) -> dict[str, tuple[Values, Values]]:
-    """Return the errors by cause in the recordings with a known motion: (n, 3), and of the magnitude: (n,)."""
+) -> dict[str, tuple[float, float]]:
+    """Return the rms error by cause in the recordings with a known motion: of the vector, and of the magnitude."""
     sensor = difference.method.sensor
     found: dict[str, list[tuple[Values, Values]]] = {}
     for recording in recordings:
@@ -184,10 +180,7 @@ def _errors(
             late = recording.time - float(recording.filter.get("delay_s", 0.0))
             delayed = np.interp(late, recording.time, np.linalg.norm(unfiltered, axis=1))
             found.setdefault("filter_delay", []).append((u - unfiltered, size - delayed))
-    return {
-        name: (np.concatenate([vector for vector, _ in errors]), np.concatenate([magnitude for _, magnitude in errors]))
-        for name, errors in found.items()
-    }
+    return {name: (_rms([v for v, _ in errors]), _rms([m for _, m in errors])) for name, errors in found.items()}
 
 
 def _shares(rms: Mapping[str, float]) -> dict[str, float]:
@@ -195,7 +188,8 @@ def _shares(rms: Mapping[str, float]) -> dict[str, float]:
     return {name: size**2 / total for name, size in rms.items()} if total > 0.0 else {}
 
 
-def _rms(errors: Values) -> float:
+def _rms(parts: Sequence[Values]) -> float:
+    errors = np.concatenate(parts)
     return float(np.sqrt(np.sum(errors**2) / len(errors)))
 
 

@@ -24,14 +24,15 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.errors import CannotCalibrateError, NotObservableError, PipelineError
-from pipeline.core.records import Dependence, Mask, Noise, Recording, SensorCalibration, UnitRecordings
+from pipeline.core.records import Dependence, Mask, Noise, Recording, SensorCalibration, SensorDiagnosis, UnitRecordings
 from pipeline.core.settings import Settings
 from pipeline.core.verdicts import Verdict
 from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.candidates import estimates
 from pipeline.estimation.design import EffectColumns
 from pipeline.estimation.effects import model_of
 from pipeline.estimation.engine import ScaledColumns, cholesky
-from pipeline.estimation.gauss_markov import WHITE_SETTING, Setting
+from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.harm import REST_FOLDS, LeftOut, left_out, rests_in_turn
 from pipeline.estimation.multi_position import fit as fitting
 from pipeline.estimation.multi_position.model import Equations, Model, NoiseHypothesis
@@ -42,7 +43,7 @@ from pipeline.estimation.observability import MORE_RESTS, never_shown, not_obser
 from pipeline.estimation.rest_means import held_out_rests
 from pipeline.estimation.stages import StageInput, is_given
 from pipeline.evaluation.diagnosis import functional_forms as forms
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, wander_of
 from pipeline.evaluation.diagnosis.method_errors import given_differences
 from pipeline.evaluation.diagnosis.residual_dependence import added_variable_of_rests, significant
 from pipeline.evaluation.diagnosis.verdict import verdict_of_selection_by_hand
@@ -68,18 +69,16 @@ def findings(case: DiagnosisInput) -> Findings:
     model, calibration, noise = _model_of_all_rests(case), case.calibration, _without_creep(case)
     given = calibration, case.configured, case.noise, case.data_sheet
     selection = SelectionByHand(model, *given)
-    expected = NoiseHypothesis(WHITE_SETTING, (0.0,) * model.kinds)
-    if noise is not None:
-        ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
-        expected = replace(expected, bias=Setting(ratio, noise.correlation_time))
+    ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
+    expected = NoiseHypothesis(Setting(ratio, noise.correlation_time), (0.0,) * model.kinds)
     with_scatter = replace(expected, scatter=selection.fits[-1].noise.scatter)
     hidden, unknown = not_observable_by_hand(selection, case.modelled), _dependences(selection)
     chi = [float(np.sum(fitting.project_out(fit.equations, [with_scatter]).residual ** 2)) for fit in selection.fits]
     moving = with_scatter if "slow" in model.rests.kinds else expected  # its accelerations are no missing effect
     over, left_over = (_over_noise(model, selection.fits[k].equations, moving) for k in (0, -1))
-    verdict = verdict_of_selection_by_hand(selection.names, unknown, left_over)
     scores = fitting.log_likelihoods(selection.fits[-1].equations, selection.hypotheses)
     best = selection.hypotheses[int(np.argmax(scores))]
+    noises = [(h.bias, score) for h, score in zip(selection.hypotheses, scores.tolist(), strict=True)]
     signal = selection.first.signal
     folds = _folds(selection, lambda part: SelectionByHand(part, *given, fitting.COMPARED_STEP))
 
@@ -96,14 +95,30 @@ def findings(case: DiagnosisInput) -> Findings:
         warmth = catalogue()["bias_temperature"]
         return f"to make bias temperature observable: record {warmth.excitation}" if warmth.name in hidden else ""
 
+    added_variable = added_variable_of_rests(selection) if selection.names else None
+    diagnosis = SensorDiagnosis(
+        verdict_of_selection_by_hand(selection.names, unknown, left_over),
+        case.configured,
+        over,
+        selection.names,
+        not_observable=hidden,
+        unexplained=unknown,
+        wander=wander_of(noises, float(np.sqrt(np.mean(model.white**2))), noise, float(best.scatter[0])),
+        method_errors=given_differences(
+            calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings
+        ),
+        details={
+            "pictures": {"added_variable": added_variable, "unexplained": []},
+            "cross_validation": _cross_validation(selection, folds),
+            "open_if_slow": slow_by_hand(selection, hidden),
+        },
+    )
     return Findings(
         sensor=case.sensor,
-        selected=selection.names,
-        verdict=verdict,
+        diagnosis=diagnosis,
         steps=selection.steps,
         alone=selection.first.scores,
-        terms=selection.fits[-1].state.terms,
-        covariance=selection.fits[-1].covariance,
+        fitted=estimates(selection.fits[-1].state.terms, selection.fits[-1].covariance),
         limits=selection.limits,
         answers=posterior(selection, never_shown(hidden, selection.names)),
         shares=lambda name: _shares(selection, name),
@@ -112,30 +127,9 @@ def findings(case: DiagnosisInput) -> Findings:
         excess=max(chi[0] - (len(selection.fits[0].residual) - selection.fits[0].rank), chi[0] - chi[-1]),
         held_out=held_out.errors,
         harmful=held_out.harmful(selection.names) | _too_few(selection, case),
-        hidden=hidden,
-        unknown=unknown,
-        over_noise=over,
         left_over_noise=left_over,
-        noises=[(h.bias, score) for h, score in zip(selection.hypotheses, scores.tolist(), strict=True)],
-        white=float(np.sqrt(np.mean(model.white**2))),
-        expected_wander=None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
         advice=advice,
         full=(lambda: calibrated(selection.fits[-1])) if selection.names else None,
-        other=case.accelerometer if case.sensor == "gyroscope" else None,
-        on_table=False,
-        departures=[text for stage in calibration.stages for text in stage.details.departures or ()],
-        scatter_over_noise=float(best.scatter[0]),
-        method_errors=given_differences(
-            calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings
-        ),
-        details={
-            "pictures": {
-                "added_variable": added_variable_of_rests(selection) if selection.names else None,
-                "unexplained": [],
-            },
-            "cross_validation": _cross_validation(selection, folds),
-            "open_if_slow": slow_by_hand(selection, hidden),
-        },
     )
 
 
@@ -170,7 +164,7 @@ def _model_of_all_rests(case: DiagnosisInput) -> Model:
 def require_model(
     recordings: Sequence[Recording],
     calibration: SensorCalibration,
-    noise: Noise | None,
+    noise: Noise,
     settings: Settings,
     accelerometer: SensorCalibration | None = None,
 ) -> Model:
@@ -187,20 +181,19 @@ def require_model(
     return model
 
 
-def _without_creep(case: DiagnosisInput) -> Noise | None:
+def _without_creep(case: DiagnosisInput) -> Noise:
     """Return the noise, with the wander of the sensor file unless a static recording determined it.
 
     In rests by hand a slow change of the attitude moves gravity between the axes and looks like a wander of the bias.
     """
     noise, data_sheet = case.noise, case.data_sheet
-    if noise is None or noise.source == "static":
+    if noise.source == "static":
         return noise
     wander = np.full(3, data_sheet.bias_wander)
     return replace(noise, wander=wander, correlation_time=data_sheet.wander_time_s)
 
 
 def _shares(selection: SelectionByHand, name: str) -> dict[str, float]:
-    """Return the share of an effect's fitted signal that each other effect reproduces."""
     scored = selection.own[name] if name in selection.names else selection.first
     signal = scored.signal.get(name)
     if signal is None or not signal.any():
@@ -287,7 +280,7 @@ def _dependences(selection: SelectionByHand) -> list[Dependence]:
     for covariate, values in (("time", rests.time), ("temperature", rests.temperature)):
         known = rests.clock_shared if covariate == "time" else not np.isnan(values).any()
         if known and np.ptp(values) > LEAST_SPAN:
-            powers = forms.powers(forms.Span(covariate, np.sort(values)), covariate)
+            powers = forms.powers(forms.Span(covariate, values), covariate)
             tests += [(covariate, powers[:degree]) for degree in (2, 3)]
     if model.sensor == "accelerometer":
         tests.append(("specific_force", FORCE))

@@ -38,7 +38,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -49,11 +48,11 @@ from pipeline.core.files import JSON
 from pipeline.core.records import BASE_COUNT, Dependence, Index, Motion, Noise, Values
 from pipeline.estimation.design import EffectColumns, placed
 from pipeline.estimation.gates import MAX_FALSE_DEPENDENCE, MIN_DELTA_BIC
-from pipeline.estimation.gauss_markov import WHITE_SETTING, Blocks, Products, Setting, selection_grid
+from pipeline.estimation.gauss_markov import Blocks, Products, Setting, selection_grid
 from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.multi_position.fit import solve
 from pipeline.estimation.observations import Observations
-from pipeline.estimation.ranking import projection
+from pipeline.estimation.ranking import by_size, projection
 from pipeline.estimation.selection import Selection
 from pipeline.evaluation.diagnosis.form_scan import ProjectedCurves, Scan, Whitened, each_explains
 from pipeline.evaluation.diagnosis.functional_forms import Curves, Span, available_signals, columns_of, signals_of
@@ -136,8 +135,7 @@ def _tests_of_curves(bases: Sequence[Basis], scan: Scan, projected: ProjectedCur
     """Return the tests with the smooth curves, ``projected``."""
     tests = [*_independent(bases, projected)]
     drops = [np.zeros((*scan.left.shape, 0))] * len(tests)
-    for size in {len(index) for _, index, _ in tests}:
-        of_size = [k for k, (_, index, _) in enumerate(tests) if len(index) == size]
+    for of_size in by_size(len(index) for _, index, _ in tests):
         together = projected.drop([tests[k][1] for k in of_size])
         for k, each in zip(of_size, np.moveaxis(together, 2, 0), strict=True):
             drops[k] = each[:, :, tests[k][2] - 1 :]
@@ -292,7 +290,7 @@ def _force(motion: Motion) -> Values:
     return np.concatenate([chebvander(scaled[:, i], CURVE_DEGREE)[:, 3:] for i in range(3)], axis=1)
 
 
-def plots(selection: Selection, unexplained: Sequence[Dependence], noise: Noise | None, reported: Selection) -> JSON:
+def plots(selection: Selection, unexplained: Sequence[Dependence], noise: Noise, reported: Selection) -> JSON:
     """Return the points of the plots of a diagnosis.
 
     ``unexplained``: the dependences for ``selection``. ``reported``: the selection that the diagnosis reports, with a
@@ -327,7 +325,7 @@ def _added_variable(regression: _Columns, selection: Selection) -> JSON:
     for c, j, x, of_axis in chosen:
         if term.effect.layout == Layout.SHARED and of_axis < MIN_INFORMATION_SHARE * information:
             continue
-        bins = Bins.of(x, regression.weight)
+        bins = Bins(x, regression.weight)
         points = bins.document(term.values[j] * x + white[:, c], sigma[c] ** 2 / bins.weight)
         panels.append({"axis": "xyz"[c], **_coefficient(term, sensor, j, uncertainty[j]), **points})
     return {"effect": selection.names[0], "unit": unit_of(sensor), "panels": panels}
@@ -387,25 +385,20 @@ def _most_significant(term: EffectColumns, sensor: str, ratio: Values) -> list[i
     return [j if ratio[j] >= 0.0 else None for j in largest]
 
 
-def _unexplained(selection: Selection, shown: Sequence[Dependence], noise: Noise | None) -> list[JSON]:
+def _unexplained(selection: Selection, shown: Sequence[Dependence], noise: Noise) -> list[JSON]:
     """Return the plots of the residual against covariates, with the curve of a suggested form."""
-    regression, setting, plots, blocks = _Columns(selection), WHITE_SETTING, [], selection.observations.blocks
-    if noise is not None and np.any(noise.wander > 0):  # as expected: the fitted wander may contain the dependence
-        setting = Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
+    regression, plots, blocks = _Columns(selection), [], selection.observations.blocks
+    # as expected: the fitted wander may contain the dependence
+    setting = Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
     covariance = blocks.covariance(setting.time)
     sigma = regression.white_noise(regression.residual - regression.wander(selection.fit.setting))
-    left = [regression.left_of(c, regression.residual[:, c], setting) for c in range(3)]
     for entry in shown:
         signal, forms = _signal_forms(selection, entry)
         values, panels = _values(selection, signal), []
         for c, (form, coefficients) in enumerate(forms):
-            bins = Bins.of(values[:, c], regression.weight)
-            residual = left[c]
-            if coefficients is not None:
-                residual = regression.left_of(c, regression.residual[:, c] - form, setting) + form
-            variance = sigma[c] ** 2 / bins.weight
-            if noise is not None and noise.wander[c] > 0.0:
-                variance += noise.wander[c] ** 2 * bins.bias_of_means(blocks, covariance)
+            bins = Bins(values[:, c], regression.weight)
+            residual = regression.left_of(c, regression.residual[:, c] - form, setting) + form
+            variance = sigma[c] ** 2 / bins.weight + noise.wander[c] ** 2 * bins.bias_of_means(blocks, covariance)
             panels.append({"axis": "xyz"[c]} | bins.document(residual, variance))
             if entry.form and coefficients is not None:
                 grid = np.linspace(float(np.nanmin(values[:, c])), float(np.nanmax(values[:, c])), CURVE)
@@ -476,26 +469,22 @@ class _Columns:
         return np.asarray(values - self.columns[c] @ known[:, -1])
 
 
-@dataclass(frozen=True)
 class Bins:
-    """The filled ones of 40 equal bins of a covariate."""
+    """The filled ones of 40 equal bins of a covariate, whose (n,) values are not finite where it is unknown.
 
-    cell: Index  # (n,), bin of each row; one beyond the last if the covariate is unknown
-    row_weight: Values  # (n,)
-    weight: Values  # (b,), sum over the rows of a bin
-    centre: Values  # (b,), weighted mean of the covariate
+    ``cell``: (n,), bin of each row; one beyond the last where the covariate is unknown. ``weight``: (b,), sum over the
+    rows of a bin. ``centre``: (b,), weighted mean of the covariate.
+    """
 
-    @classmethod
-    def of(cls, values: Values, weight: Values) -> Bins:
-        """Return the bins of a covariate; its (n,) values are not finite if unknown."""
+    def __init__(self, values: Values, weight: Values) -> None:
         known = np.isfinite(values)
         low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
         place = np.full(len(values), PLOT_BINS)
         place[known] = np.minimum((values[known] - low) * (PLOT_BINS / max(high - low, 1e-300)), PLOT_BINS - 1)
         filled, cell = np.unique(np.append(place, PLOT_BINS), return_inverse=True)
-        total: Values = np.bincount(cell[:-1], weight, len(filled))[:-1].astype(float)
-        first = cls(cell[:-1], weight, total, np.zeros(0))
-        return cls(first.cell, weight, total, first.mean(np.where(known, values, 0.0)))
+        self.cell, self.row_weight = cell[:-1], weight
+        self.weight: Values = np.bincount(self.cell, weight, len(filled))[:-1].astype(float)
+        self.centre = self.mean(np.where(known, values, 0.0))
 
     def mean(self, values: Values) -> Values:
         """Return the weighted means of (n,) values: (b,) array."""

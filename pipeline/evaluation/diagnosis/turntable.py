@@ -25,9 +25,17 @@ import numpy as np
 
 from pipeline.core.errors import ConvergenceError
 from pipeline.core.files import JSON
-from pipeline.core.records import BASE_COUNT, Index, Noise, SelectionErrors, SensorCalibration, TableEvidence, Values
+from pipeline.core.records import (
+    BASE_COUNT,
+    Index,
+    SelectionErrors,
+    SensorCalibration,
+    SensorDiagnosis,
+    TableEvidence,
+    Values,
+)
 from pipeline.core.verdicts import Verdict
-from pipeline.estimation.candidates import turns_of
+from pipeline.estimation.candidates import estimates, turns_of
 from pipeline.estimation.design import Design, EffectColumns, placed
 from pipeline.estimation.gates import MIN_DELTA_BIC, min_delta_bic
 from pipeline.estimation.generalized_least_squares import JointFit, calibration_of
@@ -38,7 +46,7 @@ from pipeline.estimation.posterior import completed, curves_of, posterior
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import ABOVE_NOISE, FAR_ABOVE, Selection, select
 from pipeline.estimation.stages import last_fit
-from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, implausible
+from pipeline.evaluation.diagnosis.findings import DiagnosisInput, Findings, implausible, wander_of
 from pipeline.evaluation.diagnosis.formula_discovery import Discovery, discover, why_not_suggested
 from pipeline.evaluation.diagnosis.method_errors import method_errors
 from pipeline.evaluation.diagnosis.residual_dependence import dependences, goodness_of_fit, plots
@@ -53,7 +61,6 @@ MOST_OF = 0.5  # share of the gain that the seconds have together, of which the 
 MAX_INFLUENTIAL_STRETCHES = 5  # that a page lists
 DETERMINED = 1e-6  # least information on an effect's weakest direction, over that of all recordings
 NEEDED_RECORDING = "record turns about all three axes on a table whose angle and rate are logged"
-NOISELESS = Noise(np.zeros(3), np.zeros(3), 1.0, "none")  # of recordings that determine no noise
 
 
 def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
@@ -197,7 +204,7 @@ def findings(case: DiagnosisInput) -> Findings:
     if second is None or (beyond and second.bic < selection.bic + MIN_DELTA_BIC):
         return found
     _, other = found_by(second, found.harmful)
-    return found if implausible(other) or other.harmful.keys() & {*other.selected} else other
+    return found if implausible(other) or other.harmful.keys() & {*other.diagnosis.selected} else other
 
 
 def _found(selection: Selection, case: DiagnosisInput, harmful: Mapping[str, str]) -> Findings:
@@ -209,19 +216,10 @@ def _found(selection: Selection, case: DiagnosisInput, harmful: Mapping[str, str
 
     def search() -> Findings | None:
         discovery = discover(selection, unknown, case)
-        if not discovery.suggested:
-            return None
         try:
-            described = _described(discovery, case, harmful)
+            return _described(discovery, case, harmful) if discovery.suggested else None
         except ConvergenceError:  # the form cannot be subtracted from held-out readings, so it is no effect of a sensor
             return None
-        reason = why_not_suggested(discovery, described.hidden)
-        if reason is None:
-            return described
-        formulas = [replace(formula, suggested=False) for formula in discovery.front]
-        held_out = described.table_evidence.held_out if described.table_evidence else None
-        evidence = TableEvidence(held_out, formulas, reason)
-        return replace(described, suggested_effect=None, table_evidence=evidence)
 
     catalogue_alone = Discovery(selection, selection, unknown)
     try:
@@ -233,23 +231,22 @@ def _found(selection: Selection, case: DiagnosisInput, harmful: Mapping[str, str
 
 
 def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mapping[str, str]) -> Findings:
-    """Return the findings of a selection and a discovery."""
-    sensor, noise, selection, reported = case.sensor, case.noise, discovery.context, discovery.reported
+    noise, selection, reported = case.noise, discovery.context, discovery.reported
     observations, unknown = selection.observations, discovery.unknown
     fits = fits_of(reported)
     errors, floor, harmful = _held_out(reported, fits, case)
     suggested = [str(discovery.suggested["name"])] if discovery.suggested else []  # in the base of ``reported``
     if suggested:  # the override adds no formula
         harmful = _held_out(reported, fits_of(reported, suggested), case)[2]
-    held_out = None
-    if errors and noise is not None:
-        held_out = SelectionErrors(errors[0], errors[-1], floor)
+    held_out = SelectionErrors(errors[0], errors[-1], floor) if errors else None
     hidden = not_observable(reported, case.modelled)
+    not_shown = {**hidden, **alike_with_zeros(reported)}
+    reason = why_not_suggested(discovery, not_shown) if discovery.suggested else None
+    formulas = discovery.front if reason is None else [replace(each, suggested=False) for each in discovery.front]
     squares = [fit.residual_rms**2 for fit in fits]
-    noise_square = None if noise is None else observations.noise_square(noise)
-    least = squares[-1] if noise_square is None else noise_square
-    at_noise = not reported.names and squares[0] < ABOVE_NOISE * least
-    excess = squares[0] if at_noise else squares[0] - min(least, squares[-1])
+    noise_square = observations.noise_square(noise)
+    at_noise = not reported.names and squares[0] < ABOVE_NOISE * noise_square
+    excess = squares[0] if at_noise else squares[0] - min(noise_square, squares[-1])
     curves = curves_of(selection) if selection.names or unknown else []
     answers = posterior(selection, [*never_shown(hidden, reported.names), *known_harmful], curves)
     verdict = verdict_of_selection(
@@ -257,7 +254,7 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         unknown,
         float(np.clip((squares[0] - squares[-1]) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0,
         2.0 * (reported.fit.log_likelihood - reported.base.log_likelihood),
-        above_noise=noise_square is not None and squares[-1] > FAR_ABOVE**2 * noise_square,
+        above_noise=squares[-1] > FAR_ABOVE**2 * noise_square,
         held_out=held_out,
         beyond=max((answers.probability(curve.name) for curve in curves), default=0.0),
     )
@@ -283,14 +280,29 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
 
     scores = reported.ranking.log_likelihoods(reported.chosen())
     noises = list(zip(reported.ranking.settings, scores.tolist(), strict=True))[1:]  # the first is white noise
+    samples = sum(r.samples for r in case.recordings if r.role in ROLES)
+    diagnosis = SensorDiagnosis(
+        verdict,
+        case.configured,
+        _over_noise(selection.base, case, observations),
+        reported.names,
+        not_observable=not_shown,
+        unexplained=unknown,
+        suggested_effect=discovery.suggested if reason is None else None,
+        method_errors=method_errors(case.calibration, reported, case.recordings, case.settings),
+        wander=wander_of(noises, float(np.sqrt(white_square)), noise),
+        on_table=TableEvidence(held_out, formulas, reason),
+        details={
+            "pictures": plots(selection, unknown, noise, reported),
+            "rows": {"rows": len(observations.weight), "samples": samples},
+        },
+    )
     return Findings(
-        sensor=sensor,
-        selected=reported.names,
-        verdict=verdict,
+        sensor=case.sensor,
+        diagnosis=diagnosis,
         steps=reported.steps,
         alone=reported.alone,
-        terms=final.terms,
-        covariance=final.covariance,
+        fitted=estimates(final.terms, final.covariance),
         limits=reported.limits,
         answers=answers,
         shares=lambda name: _shares(reported, name),
@@ -299,26 +311,10 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         excess=excess,
         held_out=errors or [None] * len(fits),
         harmful={**known_harmful, **harmful},
-        hidden={**hidden, **alike_with_zeros(reported)},
-        unknown=unknown,
-        over_noise=_over_noise(selection.base, case, observations),
         left_over_noise=_over_noise(selection.fit, case, observations),
-        noises=noises,
-        white=float(np.sqrt(white_square)),
-        expected_wander=None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
         advice=advice,
         free=lambda: calibrated(selection.base),
         full=(lambda: calibrated(selection.fit)) if selection.names else None,
-        method_errors=method_errors(case.calibration, reported, case.recordings, case.settings),
-        suggested_effect=discovery.suggested,
-        table_evidence=TableEvidence(held_out, discovery.front),
-        details={
-            "pictures": plots(selection, unknown, noise, reported),
-            "rows": {
-                "rows": len(observations.weight),
-                "samples": sum(r.samples for r in case.recordings if r.role in ROLES),
-            },
-        },
         turns=turns_of(observations),
         deeper=lambda: {
             "influence": influence(reported, [*suggested, *reported.names]),
@@ -336,8 +332,7 @@ def _held_out(
     wanders as in the recordings of the fit, if that is more than in a rest. Without held-out motion the list is empty,
     and stretches of the turns that are left out judge the effects.
     """
-    noise = case.noise or NOISELESS
-    held_out = HeldOutCase(case.calibration, case.recordings, noise, case.settings)
+    noise, held_out = case.noise, HeldOutCase(case.calibration, case.recordings, case.noise, case.settings)
     samples = held_out.held_out_samples(smoothed=True) if selection.names else []
     if not any(s.known.any() for s in samples):
         return [], 0.0, harmful_in_turns(selection, fits)
@@ -356,7 +351,6 @@ def _held_out(
 
 
 def _shares(selection: Selection, name: str) -> dict[str, float]:
-    """Return the share of an effect's fitted signal that each other effect reproduces."""
     if name in selection.names:
         chosen, ranking = selection.chosen(), selection.ranking
         return ranking.shares(ranking.indices(name)[0], chosen, ranking.of_model(chosen)[1])
@@ -365,8 +359,6 @@ def _shares(selection: Selection, name: str) -> dict[str, float]:
 
 def _over_noise(fit: JointFit, case: DiagnosisInput, observations: Observations) -> float | None:
     """Return the rms residual of a fit over that of noise alone."""
-    if case.noise is None:
-        return None
     gain = max(float(r.filter.get("noise_gain", 1.0)) for r in case.recordings)
     floor = float(np.sqrt(observations.noise_square(case.noise, gain)))
     return float(fit.residual_rms / floor) if floor > 0 else None

@@ -7,7 +7,7 @@ no effect.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -221,12 +221,6 @@ def verdict_of_selection_by_hand(
     if (unknown and not names) or (left_over_noise or 0.0) > FAR_ABOVE_BY_HAND:
         return Verdict.UNEXPLAINED
     return Verdict.MISSING_EFFECT if names else Verdict.NOTHING_MISSING
-
-
-def if_observable(verdict: Verdict, ranking: Sequence[object], hidden: Mapping[str, str]) -> Verdict:
-    """Return the verdict by a selection whose candidates may all be ``hidden``: then it shows nothing."""
-    shows_nothing = verdict == Verdict.NOTHING_MISSING and not ranking and hidden
-    return Verdict.NOT_ENOUGH_DATA if shows_nothing else verdict
 
 
 def _of_residual(e: VerdictInput) -> str:

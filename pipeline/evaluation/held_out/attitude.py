@@ -97,15 +97,14 @@ def attitude(
     shown = np.unique(np.linspace(0, known.samples - 1, CURVE_POINTS).astype(int))
     seconds, curve = float(min(DRIFT_TIME_S, time[-1] - time[0])), {"time_s": _rounded(time[shown] - time[0])}
     drifts: dict[str, float] = {}
-    tilts: dict[str, float] | None = {} if accelerometer and known.accelerometer is not None else None
+    tilts: dict[str, float] = {}
     for name, readings in (("before", known), ("after", compensated)):
         force, rate = readings.accelerometer, readings.gyroscope
         assert rate is not None  # noqa: S101
         alone = integrate(time, rate, reference[:, 0])
         drifts[name] = drift(time, alone, reference, seconds)
         curve[f"drift_{name}"] = _rounded(angle_between(alone[:, shown], reference[:, shown]))
-        if tilts is not None:
-            assert force is not None  # noqa: S101
+        if accelerometer and force is not None:
             steps, fused = _fuse(time, force, alone)
             up, true_up = level_in_body(fused), level_in_body(reference[:, steps].T)
             sine, cosine = length(cross(up, true_up)), np.einsum("ij,ij->i", up, true_up)
@@ -113,7 +112,7 @@ def attitude(
             tilts[name] = float(np.sqrt(np.mean(tilt[since >= min(TILT_SETTLING_S, 0.5 * since[-1])] ** 2)))
             curve[f"tilt_{name}"] = _rounded(np.interp(time[shown] - time[0], since, tilt))
     found = {"reason": None, "recording": recording.name, "seconds": seconds}
-    return found | {"drift_deg": drifts, "tilt_rms_deg": tilts, "curve": curve}
+    return found | {"drift_deg": drifts, "tilt_rms_deg": tilts or None, "curve": curve}
 
 
 def integrate(time: Values, rate: Values, start: Values) -> Values:

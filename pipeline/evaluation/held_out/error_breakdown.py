@@ -47,7 +47,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
-from typing import Any, TypeAlias, cast
+from typing import TypeAlias
 
 import numpy as np
 
@@ -64,6 +64,7 @@ from pipeline.core.records import (
     Values,
     corrected,
     finite_rows,
+    motion_at_rest,
 )
 from pipeline.core.settings import Settings, Table
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, STATED_WIDTH, block_covariance
@@ -113,22 +114,9 @@ def error_breakdown(calibration: SensorCalibration, samples: Sequence[Samples]) 
     return rows if directed else [replace(row, vector_rms_error=None) for row in rows], notes
 
 
-def last_step(calibration: SensorCalibration, samples: Samples) -> Corrected | None:
-    """Return calibrated readings, magnitude and vector of the reference with all effects; None if one is left out."""
-    if left_out(calibration, [samples]):
-        return None
-    return _with_effects(calibration, calibration.effects, samples)
-
-
 def left_out(calibration: SensorCalibration, samples: Sequence[Samples]) -> list[str]:
     """Return the names of the effects that cannot be subtracted from some of the samples."""
     return [fitted.name for fitted in calibration.effects if any(_lack(fitted, s) for s in samples)]
-
-
-def last_error_of_magnitude(calibration: SensorCalibration, samples: Samples) -> Values | None:
-    """Return the error of the magnitude after the last step, (n,); None if an effect is left out."""
-    found = last_step(calibration, samples)
-    return None if found is None else vector_errors([found], directed=False)[:, 0]
 
 
 def errors_of(calibrations: Sequence[SensorCalibration], samples: Sequence[Samples]) -> tuple[list[InPieces], Values]:
@@ -162,15 +150,18 @@ def vector_errors(corrected: Sequence[Corrected], *, directed: bool) -> Values:
 
 
 def with_known_effects(calibration: SensorCalibration, samples: Samples) -> Corrected:
-    """Return the same as ``last_step``, with the effects that can be subtracted from the samples."""
+    """Return calibrated readings, magnitude and vector of the reference, with the effects that can be subtracted."""
     return _with_effects(calibration, [fitted for fitted in calibration.effects if not _lack(fitted, samples)], samples)
 
 
-def rms_error_of(calibration: SensorCalibration, samples: Sequence[Samples]) -> float | None:
-    """Return the rms error of the magnitude with the effects that can be subtracted; None without samples."""
-    if not samples:
-        return None
-    error = vector_errors([with_known_effects(calibration, s) for s in samples], directed=False)[:, 0]
+def magnitude_errors(calibration: SensorCalibration, samples: Sequence[Samples]) -> Values:
+    """Return the errors of the magnitude with the effects that can be subtracted: (n,) array."""
+    return vector_errors([with_known_effects(calibration, s) for s in samples], directed=False)[:, 0]
+
+
+def rms_error_of(calibration: SensorCalibration, samples: Sequence[Samples]) -> float:
+    """Return the root mean square of the ``magnitude_errors`` that are known."""
+    error = magnitude_errors(calibration, samples)
     return float(np.sqrt(np.mean(error[np.isfinite(error)] ** 2)))
 
 
@@ -219,7 +210,6 @@ def _elsewhere(fitted: FittedEffect, samples: Samples) -> bool:
 
 
 def _with_effects(calibration: SensorCalibration, effects: Sequence[FittedEffect], samples: Samples) -> Corrected:
-    """Return calibrated readings, magnitude and vector of the reference with some effects."""
     effects = [fitted for fitted in effects if not _elsewhere(fitted, samples)]
     if not effects:
         return _uncorrected(samples, linear_truth(calibration, samples.reading))
@@ -242,7 +232,6 @@ def direction_known(calibration: SensorCalibration, samples: Samples) -> bool:
 
 
 def _moved(motion: Motion, effects: Sequence[FittedEffect]) -> Motion:
-    """Return the motion after the effects of timing."""
     for fitted in effects:
         motion = effect_of(fitted).moved(motion, fitted.values)
     return motion
@@ -261,16 +250,10 @@ def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> Value
     time, spline = samples.time, make_interp_spline(samples.time, samples.magnitude, k=SPLINE_DEGREE)
     interval = float(np.median(np.diff(time)))
 
-    def motion(offset: float | Values = 0.0) -> Motion:
-        at = np.clip(time + offset, time[0] - interval, time[-1] + interval)
-        rate, nothing = np.zeros((2, len(time), 3))
-        rate[:, 0] = spline(at)
-        still = np.zeros(len(time), bool)
-        later = partial(moved_on, offset)
-        return Motion(time, nothing, rate, nothing, nothing, None, None, None, None, still, at_offset=later)
-
-    def moved_on(before: float | Values, offset: float | Values) -> Motion:
-        return motion(before + offset)
+    def motion(before: float | Values = 0.0, offset: float | Values = 0.0) -> Motion:
+        later, rate = before + offset, np.zeros((len(time), 3))
+        rate[:, 0] = spline(np.clip(time + later, time[0] - interval, time[-1] + interval))
+        return motion_at_rest(time).changed(angular_rate=rate, at_offset=partial(motion, later))
 
     return np.asarray(np.abs(_moved(motion(), effects).angular_rate[:, 0]))
 
@@ -303,26 +286,20 @@ def _by_calibrated_log(calibration: SensorCalibration, effects: Sequence[FittedE
 class LinearizedSamples:
     """Representative held-out samples of one recording, with the derivative of their calibrated readings."""
 
-    time: Values  # (n,), s
-    white_variance: Values  # (n, 3), of white noise per reading axis
-    wander_variance: Values  # (n, 3)
+    samples: Samples
     truth: Values  # (n, 3), g or deg/s
     derivative: Values  # (n, 3, p): J, with respect to the parameters of the calibration's covariance
     number: int  # known samples of the recording
-    correlated_samples: float = 1.0  # as in ``Samples``
 
 
-def linearized(calibration: SensorCalibration, samples: Samples) -> LinearizedSamples | None:
-    """Return representative held-out samples with their derivative; None where an effect is left out of them.
+def linearized(calibration: SensorCalibration, samples: Samples) -> LinearizedSamples:
+    """Return representative held-out samples with their derivative, for a calibration of which no effect is left out.
 
     ``calibrated = M (reading - b - z)`` gives ``d/db = -M`` and ``d/dM_ij = e_i (M^-1 calibrated)_j``. The derivative
     with respect to a parameter of an effect is a difference quotient over one standard uncertainty. Where an effect
     moves the reference in time, the change of its magnitude counts along the truth with the opposite sign.
     """
-    found = last_step(calibration, samples)
-    if found is None:
-        return None
-    vector, magnitude, _ = found
+    vector, magnitude, _ = _with_effects(calibration, calibration.effects, samples)
     chosen = samples.representative
     truth = reference_vector(calibration, samples, chosen)
     along = truth / np.maximum(length(truth), 1e-300)[:, None]
@@ -332,31 +309,18 @@ def linearized(calibration: SensorCalibration, samples: Samples) -> LinearizedSa
     before = vector[chosen] @ inverse_of(calibration).T
     for i, row in enumerate(MATRIX_ROWS):
         J[:, i, row] = before
-    names = [(n, name) for n, effect in enumerate(calibration.effects) for name in effect.parameters]
-    for column, (n, name) in enumerate(names, BASE_COUNT):
+    places = [(n, k) for n, effect in enumerate(calibration.effects) for k in range(len(effect.parameters))]
+    for column, (n, k) in enumerate(places, BASE_COUNT):
         if (step := steps[column]) > 0.0:
-            moved = last_step(_changed(calibration, n, name, step), samples)
-            assert moved is not None  # noqa: S101  (the same effects)
+            effects = list(calibration.effects)
+            values = effects[n].values
+            values[k] += step
+            effects[n] = effects[n].at(values.tolist())
+            moved = _with_effects(replace(calibration, effects=tuple(effects)), effects, samples)
             shift = along * (moved[1] - magnitude)[chosen, None]
             J[:, :, column] = (moved[0][chosen] - vector[chosen] - shift) / step
-    return LinearizedSamples(
-        samples.time[chosen],
-        samples.white_variance[chosen],
-        samples.wander_variance[chosen],
-        truth,
-        J if np.isfinite(J).all() else np.nan_to_num(J),
-        int(np.count_nonzero(samples.known)),
-        samples.correlated_samples,
-    )
-
-
-def _changed(calibration: SensorCalibration, number: int, name: str, step: float) -> SensorCalibration:
-    """Return a calibration with a parameter of one of its effects changed by a step."""
-    effects = list(calibration.effects)
-    parameters = effects[number].parameters
-    changed = replace(parameters[name], value=parameters[name].value + step)
-    effects[number] = replace(effects[number], parameters={**parameters, name: changed})
-    return replace(calibration, effects=tuple(effects))
+    number = int(np.count_nonzero(samples.known))
+    return LinearizedSamples(samples, truth, J if np.isfinite(J).all() else np.nan_to_num(J), number)
 
 
 def expected_rms_error(
@@ -469,37 +433,39 @@ def _form(
     total = sum(each.number for each in held_out)
     white, within, size = np.zeros(2), np.zeros(2), q
     of_parameters, of_blocks = np.zeros((q, q)), []
-    for every in held_out:
-        whole = len(every.time)
-        thin = {name: v[:: -(-whole // FORM_SAMPLES)] for name, v in vars(every).items() if isinstance(v, np.ndarray)}
-        each: LinearizedSamples = replace(every, **cast("dict[str, Any]", thin))
-        n, share = len(each.truth), each.number / total
+    for each in held_out:
+        samples, rows = each.samples, each.samples.representative
+        time, whole, share = samples.time[rows], len(rows), each.number / total
+        thin = slice(None, None, -(-whole // FORM_SAMPLES))
+        truth, derivative = each.truth[thin], each.derivative[thin]
+        of_white, of_wander = samples.white_variance[rows[thin]], samples.wander_variance[rows[thin]]
+        n = len(truth)
         count = max(1, min(n, round(HELD_OUT_BLOCKS * share)))
         label = np.arange(n) * count // n
         first = np.searchsorted(label, np.arange(count))
-        interval = (every.time[-1] - every.time[0]) / max(whole - 1, 1) if whole > 1 else 1.0
-        start = each.time[first]
-        length = np.maximum(np.diff(start, append=every.time[-1] + interval), 1e-6)
+        interval = (time[-1] - time[0]) / max(whole - 1, 1) if whole > 1 else 1.0
+        start = time[thin][first]
+        length = np.maximum(np.diff(start, append=time[-1] + interval), 1e-6)
         B = block_covariance(start, length, noise.correlation_time)
-        W = _weights(M, each, covariance[:-1, :-1], drift + coarse)
-        J = np.concatenate([each.derivative, -each.truth[:, :, None]], axis=2)
+        W = _weights(M, truth, derivative, of_white + of_wander + (drift + coarse), covariance[:-1, :-1])
+        J = np.concatenate([derivative, -truth[:, :, None]], axis=2)
         WJ, MWM = W @ J, M.T @ W @ M
         of_parameters += share / n * (J.reshape(-1, q).T @ WJ.reshape(-1, q))
-        of_wander = np.add.reduceat(MWM, first, axis=0) * share / n
+        inner = np.add.reduceat(MWM, first, axis=0) * share / n
         across = np.swapaxes(np.add.reduceat(WJ, first, axis=0), 1, 2) @ M * share / n
-        of_blocks.append((of_wander, across, B, block_covariance(start, length, drift_time)))
+        of_blocks.append((inner, across, B, block_covariance(start, length, drift_time)))
         size += 3 * count
-        Q = MWM * (each.white_variance + coarse)[:, None, :]
-        white = white + _traces_of(Q) * [share, share**2 * each.correlated_samples / each.number]
-        within_block = np.clip(each.wander_variance - np.diag(B)[label, None] * noise.wander**2, 0.0, None)
+        Q = MWM * (of_white + coarse)[:, None, :]
+        white = white + _traces_of(Q) * [share, share**2 * samples.correlated_samples / each.number]
+        within_block = np.clip(of_wander - np.diag(B)[label, None] * noise.wander**2, 0.0, None)
         correlated = np.clip(noise.correlation_time / interval, 1.0, whole / count) / whole
         within = within + _traces_of(MWM * within_block[:, None, :]) * [share, share**2 * correlated]
     A, Q = np.zeros((size, size)), np.zeros((3, size, size))
     A[:q, :q], at = of_parameters, q
-    for of_wander, across, B, slow in of_blocks:  # the blocks of a recording have the covariance in time, on each axis
-        count = len(of_wander)
+    for inner, across, B, slow in of_blocks:  # the blocks of a recording have the covariance in time, on each axis
+        count = len(inner)
         blocks, own = slice(at, at + 3 * count), np.zeros((count, 3, count, 3))
-        own[range(count), :, range(count)] = of_wander
+        own[range(count), :, range(count)] = inner
         A[blocks, blocks], A[blocks, :q] = own.reshape(3 * count, -1), across.swapaxes(1, 2).reshape(-1, q)
         A[:q, blocks], at = A[blocks, :q].T, blocks.stop
         for k, in_time, of_axis in ((1, B, noise.wander**2), (2, slow, drift)):
@@ -524,14 +490,13 @@ def _traces_of(Q: Values) -> Values:
     return np.array([np.einsum("nii->", Q), np.einsum("nij,nji->", Q, Q)]) / len(Q)
 
 
-def _weights(M: Values, each: LinearizedSamples, C: Values, slow: Values) -> Values:
-    """Return W of each sample, (n, 3, 3); ``C``: covariance of the parameters, ``slow``: (3,), further variance."""
-    J, noise = each.derivative, each.white_variance + each.wander_variance + slow
+def _weights(M: Values, truth: Values, J: Values, variance: Values, C: Values) -> Values:
+    """Return W of each sample, (n, 3, 3); ``variance``: (n, 3), of the noise; ``C``: covariance of the parameters."""
     by_axis, of_axis = (v.swapaxes(0, 1).reshape(3, -1) for v in (J, (J.reshape(-1, len(C)) @ C).reshape(J.shape)))
-    mean = M * noise.mean(axis=0) @ M.T + of_axis @ by_axis.T / len(J)
-    size = length(each.truth)
-    u = each.truth / np.where(size > 0.0, size, 1.0)[:, None]
-    g = mean_squares(each.truth, mean)[1][:, None, None]
+    mean = M * variance.mean(axis=0) @ M.T + of_axis @ by_axis.T / len(J)
+    size = length(truth)
+    u = truth / np.where(size > 0.0, size, 1.0)[:, None]
+    g = mean_squares(truth, mean)[1][:, None, None]
     return np.asarray((1.0 - g) * u[:, :, None] * u[:, None, :] + g * np.eye(3))
 
 

@@ -143,44 +143,41 @@ def validate(
         elif samples := case.fit_samples():
             reason += "; judged on the samples of the fit"
     count = int(sum(s.known.sum() for s in samples))
-    part = SensorValidation(
-        unit=unit_of(sensor),
-        held_out=reason is None,
-        reason=reason,
-        samples=count,
-        noise=noise,
-        steps=(StepErrors("raw"), StepErrors("calibrated")),
-    )
-    if count:
-        steps, notes = breakdown.error_breakdown(calibration, samples)
-        floor, vector_floor = noise_floor(calibration, samples), vector_noise_floor(calibration, samples)
-        part = replace(
-            part,
-            noise_floor=floor,
-            vector_noise_floor=vector_floor,
-            reference_rms=float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2))),
-            steps=tuple(steps),
-            over_temperature=_over_temperature(case, samples, held_out=part.held_out),
+    held_out, limits = reason is None, settings.limits.of(sensor)
+    about: dict[str, Any] = {"unit": unit_of(sensor), "held_out": held_out, "reason": reason, "samples": count}
+    if not count:
+        nothing = StepErrors("raw"), StepErrors("calibrated")
+        checked = _check_limits(calibration, nothing[-1], limits)
+        return SensorValidation(**about, noise=noise, steps=nothing, limits=checked)
+    steps, notes = breakdown.error_breakdown(calibration, samples)
+    expected, agreement, worse = None, None, None
+    known = [s for s in samples if s.known.any()]
+    if names := breakdown.left_out(calibration, known):
+        verb = "is" if len(names) == 1 else "are"
+        notes.append(
+            f"the expected error is not stated, because {', '.join(names)} {verb} left out of the held-out error"
         )
-        parts = [breakdown.linearized(calibration, s) for s in samples if s.known.any()]
-        complete = [p for p in parts if p is not None]
-        if len(complete) == len(parts):
-            expected = _expected(case, samples, complete)
-            part = replace(part, expected_rms_error=expected)
-            notes += [EARTH_LEFT_OUT] if any(s.earth_left_out for s in samples) else []
-            if part.held_out:
-                agreement = _agreement(case, samples, complete)
-                part = replace(
-                    part, agreement=agreement, worse_than_raw=_worse_than_raw(case, samples, steps, expected[1])
-                )
-        else:
-            names = breakdown.left_out(calibration, samples)
-            verb = "is" if len(names) == 1 else "are"
-            notes.append(
-                f"the expected error is not stated, because {', '.join(names)} {verb} left out of the held-out error"
-            )
-        part = replace(part, notes=tuple(notes), reduced=tuple(reduced(case, samples, held_out=part.held_out)))
-    return replace(part, limits=_check_limits(calibration, part.steps[-1], settings.limits.of(sensor)))
+    else:
+        parts = [breakdown.linearized(calibration, s) for s in known]
+        expected = _expected(case, parts)
+        notes += [EARTH_LEFT_OUT] if any(s.earth_left_out for s in samples) else []
+        if held_out:
+            agreement, worse = _agreement(case, parts), _worse_than_raw(case, known, steps, expected[1])
+    return SensorValidation(
+        **about,
+        noise=noise,
+        noise_floor=noise_floor(calibration, samples),
+        vector_noise_floor=vector_noise_floor(calibration, samples),
+        reference_rms=float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2))),
+        steps=tuple(steps),
+        notes=tuple(notes),
+        expected_rms_error=expected,
+        worse_than_raw=worse,
+        agreement=agreement,
+        over_temperature=_over_temperature(case, samples, held_out=held_out),
+        reduced=tuple(reduced(case, samples, held_out=held_out)),
+        limits=_check_limits(calibration, steps[-1], limits),
+    )
 
 
 def _over_temperature(case: HeldOutCase, samples: Sequence[Samples], *, held_out: bool) -> OverTemperature | None:
@@ -206,9 +203,9 @@ def residuals_over_temperature(
     """
     temperatures, errors = [np.zeros(0)], [np.zeros(0)]
     for each in samples:
-        error = breakdown.last_error_of_magnitude(calibration, each)
-        if error is None or each.temperature is None:
+        if breakdown.left_out(calibration, [each]) or each.temperature is None:
             return None
+        error = breakdown.magnitude_errors(calibration, [each])
         known = each.known & np.isfinite(error) & np.isfinite(each.temperature)
         temperatures.append(each.temperature[known])
         errors.append(error[known])
@@ -221,8 +218,8 @@ def residuals_over_temperature(
     return [TemperatureBin(float(w.mean()), float(e.mean()), float(np.sqrt(np.mean(e**2))), len(e)) for w, e in parts]
 
 
-def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> tuple[float, float]:
-    """Return the interval of the last step's rms error; ``parts``: the samples with their derivatives.
+def _expected(case: HeldOutCase, parts: Sequence[LinearizedSamples]) -> tuple[float, float]:
+    """Return the interval of the last step's rms error.
 
     Earth's rotation, where it is left out of a magnitude, changes the rms error by its rate at most.
     """
@@ -230,7 +227,7 @@ def _expected(case: HeldOutCase, samples: Sequence[Samples], parts: Sequence[Lin
     fitted = [r for r in case.recordings if r.role in {sensor, "rests"} and r.samples and r.reading(sensor) is not None]
     fitted_s = sum(float(r.time[-1] - r.time[0]) for r in fitted)
     low, high = breakdown.expected_rms_error(case.calibration, parts, case.noise, case.settings, fitted_s)
-    earth = EARTH_RATE_DPS if any(s.earth_left_out for s in samples) else 0.0
+    earth = EARTH_RATE_DPS if any(part.samples.earth_left_out for part in parts) else 0.0
     return max(low - earth, 0.0), high + earth
 
 
@@ -242,7 +239,7 @@ def static_error(case: HeldOutCase) -> HeldOutError | None:
     """
     static = {r.name: [Rest(0, r.samples)] for r in case.recordings if r.role == "static" and r.samples}
     turning = 2.0 * EARTH_RATE_DPS if case.calibration.sensor == "gyroscope" else 0.0
-    judged = last_error(case, [s for s in case.at_rests(static) if s.known.any()], explained=turning)
+    judged = last_error(case, case.at_rests(static), explained=turning)
     return judged and replace(judged, low=max(judged.low - turning, 0.0), high=judged.high + turning)
 
 
@@ -252,21 +249,18 @@ def last_error(case: HeldOutCase, samples: Sequence[Samples], *, explained: floa
     None without samples or interval, or if the error is not larger than ``explained``.
     """
     known = [s for s in samples if s.known.any()]
-    errors = [e for s in known if (e := breakdown.last_error_of_magnitude(case.calibration, s)) is not None]
-    if not errors or len(errors) < len(known):
+    if not known or breakdown.left_out(case.calibration, known):
         return None
-    error = float(np.sqrt(np.nanmean(np.concatenate(errors) ** 2)))
+    error = breakdown.rms_error_of(case.calibration, known)
     parts = [breakdown.linearized(case.calibration, s) for s in known if error > explained]
-    complete = [p for p in parts if p is not None]
-    return HeldOutError(error, *_expected(case, samples, complete)) if complete else None
+    return HeldOutError(error, *_expected(case, parts)) if parts else None
 
 
-def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[LinearizedSamples]) -> Agreement | None:
-    """Return how the matrix agrees with held-out motion.
+def _agreement(case: HeldOutCase, parts: Sequence[LinearizedSamples]) -> Agreement | None:
+    """Return how the matrix agrees with held-out motion; ``parts``: of the held-out recordings.
 
     None where no held-out motion has a vector reference, the method fixes elements of the matrix, a filter was applied,
-    or an effect moves the motion in time. ``held_out``: the samples of the held-out recordings; ``parts``: the same
-    with their derivatives.
+    or an effect moves the motion in time.
     """
     calibration, settings = case.calibration, case.settings
     sensor = calibration.sensor
@@ -276,14 +270,14 @@ def _agreement(case: HeldOutCase, held_out: Sequence[Samples], parts: Sequence[L
     moved = any(effect_of(fitted).moves for fitted in calibration.effects)
     if not (of_method and recordings and vectors and calibration.covariance is not None) or moved:
         return None
-    if len(parts) < len(recordings) or any(samples.resting for samples in held_out):
+    if len(parts) < len(recordings) or any(part.samples.resting for part in parts):
         return None
     calibrated, slopes = [], np.zeros((9, len(calibration.covariance)))
-    for recording, samples, part in zip(recordings, held_out, parts, strict=True):
-        found = breakdown.last_step(calibration, samples)
-        if found is None or found[2] is None or not breakdown.direction_known(calibration, samples):
+    for recording, part in zip(recordings, parts, strict=True):
+        samples = part.samples
+        reading, _, truth = breakdown.with_known_effects(calibration, samples)
+        if truth is None or not breakdown.direction_known(calibration, samples):
             return None
-        reading, truth = found[0], found[2]
         known = samples.known & finite_rows(reading + truth)
         chosen = truth[samples.representative]
         rows = finite_rows(chosen)
@@ -331,7 +325,6 @@ def vector_noise_floor(calibration: SensorCalibration, samples: Sequence[Samples
 
 
 def _why_not_held_out(case: HeldOutCase) -> str:
-    """Return why no samples are held out."""
     reason = f"no held-out recording holds readings of the {case.calibration.sensor} and a reference for them"
     procedure = case.settings.procedure
     if procedure.sheet is not None:
@@ -361,12 +354,11 @@ def _worse_than_raw(
     sizes = [step.rms_error or 0.0 for step in (steps[0], steps[-1])]
     if sizes[1] <= max(sizes[0], allowed):
         return None
-    errors = [breakdown.last_error_of_magnitude(case.calibration, s) for s in samples]
-    after = [error[s.known] for error, s in zip(errors, samples, strict=True) if error is not None]
-    if len(after) < len(samples) or sum(map(len, after)) < MIN_T_TEST_SAMPLES:
+    known = np.concatenate([s.known for s in samples])
+    raw = np.concatenate([length(s.reading) - s.magnitude for s in samples])[known]
+    calibrated = breakdown.magnitude_errors(case.calibration, samples)[known]
+    if len(raw) < MIN_T_TEST_SAMPLES:
         return None
-    raw = np.concatenate([(length(s.reading) - s.magnitude)[s.known] for s in samples])
-    calibrated = np.concatenate(after)
     pieces = np.array_split(calibrated**2 - raw**2, min(STRETCHES, len(raw)))
     means = np.array([piece.mean() for piece in pieces])
     from scipy.special import stdtrit  # noqa: PLC0415  (only where the calibration seems to be worse)
