@@ -135,6 +135,11 @@ def held_out(after: float) -> SelectionErrors:
         ),
         (replace(NOTHING, found="unexplained"), "unexplained", "1 times its noise"),
         (replace(NOTHING, found="unexplained", unknown=("time",)), "unexplained", "depends on time"),
+        (
+            replace(NOTHING, found="unexplained", selected=("lever_arm", "g_sensitivity", "bias_drift", "cross_axis")),
+            "unexplained",
+            "It takes 4 effects together",
+        ),
         (replace(BEYOND, held_out=held_out(after=0.99)), "unexplained", "sensor file"),
         (replace(BEYOND, held_out=held_out(after=0.99), published=ABOVE, full=INSIDE), "unexplained", "sensor file"),
         (replace(BEYOND, held_out=held_out(after=0.3)), "missing_effect", "sensor file"),

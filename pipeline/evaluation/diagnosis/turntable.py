@@ -270,7 +270,7 @@ def _described(discovery: Discovery, case: DiagnosisInput, known_harmful: Mappin
         if verdict == Verdict.UNEXPLAINED:
             return FAR_OFF
         if one_way(observations):
-            both = [plain(n) for n, e in catalogue().items() if e.needs_both_directions and sensor in e.sensors]
+            both = [plain(n) for n, e in catalogue().items() if e.needs_both_directions and case.sensor in e.sensors]
             return f"make every turn in the other direction too: only both directions show {', '.join(both)}"
         proposed = next((this for name, this in catalogue().items() if this.proposed and name in hidden), None)
         return f"to make {plain(proposed.name)} observable: record {proposed.excitation}" if proposed else ""

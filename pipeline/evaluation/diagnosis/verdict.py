@@ -146,6 +146,11 @@ class VerdictInput:
         return self.held_out.error_after**2 > (1.0 - HELPFUL) * self.held_out.error_before**2
 
     @property
+    def too_many(self) -> bool:
+        """Whether more effects were selected than a unit usually has."""
+        return len(self.selected) > BELIEVED
+
+    @property
     def too_quiet(self) -> bool:
         """Whether the residual is too small for the noise estimate."""
         small = self.over_noise is not None and self.over_noise < MIN_RESIDUAL_OVER_NOISE
@@ -291,7 +296,7 @@ def _offered(verdict: Verdict, diagnosis: SensorDiagnosis, e: VerdictInput) -> b
     """Return whether to offer the selected effects: if ``unexplained``, each must be plausible and help on held-out."""
     if e.given:
         return False
-    if verdict != Verdict.UNEXPLAINED or e.implausible or len(e.selected) > BELIEVED:
+    if verdict != Verdict.UNEXPLAINED or e.implausible or e.too_many:
         return verdict == Verdict.MISSING_EFFECT
     errors = [(entry.held_out_error_before, entry.held_out_error_after) for entry in diagnosis.chosen]
     lower = [a is not None and b is not None and b**2 < (1.0 - HELPFUL) * a**2 for a, b in errors]

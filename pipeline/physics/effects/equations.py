@@ -80,8 +80,8 @@ STARTS_S = (60.0, 180.0, 500.0, 1500.0)  # from a part of some grams to a box of
 MIN_WARM_UP_S, MAX_WARM_UP_S = 1.0, 1e5  # a shorter warm-up is a step at the start, a longer one a drift
 START_LAG_S = 0.005  # not 0, where a lag and a time offset have the same column; below the lag of a 30 Hz filter
 PPM = 1e-6  # one part in a million
-# of a difference: its rounding is 1e-10 of u per second, and its error 1e-4 of the slope where u bends, behind 5 ms
-DIFFERENCE_STEP_S = 1e-6
+# of a difference: its rounding is 1e-9 of u per second, and its error 1e-5 of the slope where u bends, behind 5 ms
+DIFFERENCE_STEP_S = 1e-7
 OTHER_PREFIX = "other_"  # prefix of the names of free curves
 BEND = ":bend"  # suffix of the name of the second form; answers state it under the name of the first
 BEND_WIDTHS = np.geomspace(0.1, 0.5, 12)  # of a bend, shares of the span: sharper ones are steps, wider ones parabolas
