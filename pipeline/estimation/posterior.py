@@ -9,11 +9,9 @@ averaged over sets, scales and noises. It is stated only for effects that were n
 are two of three units (26 of 40 simulated ones), so that a share of 1/30 of all limits is 5 % of the stated ones.
 Source: Hoeting et al., Statistical Science 14 (1999), 382-417; conjugate prior of Zellner.
 
-Compute the posterior over effects in turns on a table: a linear problem for each relevant set of timing effects.
-
-Columns are computed at the fit of the selected effects. The readings are linearised there: ``y = r + Z p`` with the
-residual r, the columns Z and the values p of the selected effects. An effect of timing changes the motion and so all
-columns; if sets with other timing effects are probable, the fit is repeated with these effects.
+In turns on a table, columns are computed at the fit of the selected effects. The readings are linearised there: ``y = r
++ Z p`` with the residual r, the columns Z and the values p of the selected effects. An effect of timing changes the
+motion and so all columns; if sets with other timing effects are probable, the fit is repeated with these effects.
 """
 
 from __future__ import annotations

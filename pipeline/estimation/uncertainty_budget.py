@@ -13,7 +13,7 @@ file, and lack of fit beyond both. All other contributions are of type B, with i
 
 Sources without a stated accuracy are listed as not included.
 
-Compute how each effect of the sensor file, at its limit, would change bias and matrix of a fit without that effect.
+An effect of the sensor file at its limit would change bias and matrix of a fit without that effect by
 
     d beta = sum over rows A z(p_j = limit_j),    up to sum_j |d beta_j|
 

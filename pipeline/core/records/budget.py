@@ -1,6 +1,7 @@
-"""The uncertainty budget of a sensor's calibration: its lines, the sources it does not include, a Monte Carlo run.
+"""The parameters of a sensor's calibration, and its uncertainty budget.
 
-The parameters of a sensor's calibration: their names, units, values, covariance and degrees of freedom.
+Parameters have names, units, values, a covariance and degrees of freedom. The budget has lines, the sources that it
+does not include, and a Monte Carlo run.
 
 Every vector and covariance of parameters has this order: ``bias_x .. bias_z``; ``matrix_xx, matrix_xy .. matrix_zz``,
 row by row; then ``<effect>.<parameter>``, or the parameters of a stage. The base is bias and matrix.

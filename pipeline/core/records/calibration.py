@@ -3,9 +3,8 @@
 reading = bias + matrix^-1 @ truth + effects + noise
 truth   = matrix @ (reading - bias - effects)
 
-Correct readings by the steps of a method, each of which acts on the output of the step before.
-
-The steps act on row vectors v. Published is ``{"steps": [...]}`` with one entry for each:
+The steps of a method correct readings, too. Each acts on the row vectors v that the step before returns. Published is
+``{"steps": [...]}`` with one entry for each:
 
     {"subtract": b}                                          v - b
     {"matrix": M}                                            v M^T, that is M v as a column

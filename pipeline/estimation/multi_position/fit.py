@@ -16,9 +16,8 @@ rest, or the amplitude of a warm-up far from its end. So the last fit of plausib
 precision P: the sensor file's limits of their parameters p are two standard deviations. P is zero for bias, matrix,
 time constants and parameters without a limit.
 
-Likelihoods of the model of one sensor in rests and moves (``model``), and of candidates in addition to it.
-
-The steadiness of a unit by hand is unknown: a, c, q and k are free in all comparisons. The likelihood of a model is
+Models (``model``), and candidates in addition to them, are compared by their likelihood. The steadiness of a unit by
+hand is unknown: a, c, q and k are free in all comparisons. The likelihood of a model is
 
     -2 log L = rss / k + n log k + log det C,    rss = min_d (r - X d)^T C^-1 (r - X d),    k = max(1, rss / n)
 

@@ -3,7 +3,7 @@
 ``turntable`` or, for rests and moves by hand, ``multi_position`` selects effects and returns ``Findings``.
 ``diagnosis_of`` states them as a diagnosis, which ``verdict`` compares with the error on held-out motion.
 
-Find the selected effects that are no possible cause of the residual, with the reasons.
+Selected effects are no possible cause of the residual by four reasons:
 
     beyond the sensor file      |p| - 1.96 u > 3 limit, unless the settings accept it
     by the thermometer          the temperature changes by less than its resolution
@@ -14,7 +14,7 @@ Find the selected effects that are no possible cause of the residual, with the r
 
 Such effects fit best, and are listed as ``candidates``; the verdict is ``unexplained`` and nothing is offered.
 
-Compute the effective noise in motion: white noise whose averages scatter as much as those of the error in motion.
+The effective noise in motion is white noise whose averages scatter as much as those of the error in motion:
 
     n_e(t)^2 = t var(mean of the error over t),    over_white = n_e / n,   n^2 = white^2 dt
 

@@ -1,18 +1,16 @@
-"""Select the effects that the model of a sensor lacks, from turns on a table.
+"""Select the effects that the model of a sensor lacks, from turns on a table, and what shows them.
 
 The held-out error of a fit is the rms length of ``matrix (reading - model)`` if the attitude is logged, else the rms
 error of the magnitude. It is compared with the noise floor of ``pipeline.evaluation.held_out.validation``.
 
-Find the recordings and seconds that show an effect, and whether the evidence depends on one recording.
-
-The gain of an effect is a sum over seconds:
+The gain of an effect is a sum over seconds, of which the largest are listed:
 
     gain = r0^T C^-1 r0 - r1^T C^-1 r1,    r0 = r1 + Z gamma - X (X^T C^-1 X)^-1 X^T C^-1 Z gamma
 
 with the residual r1 of the fit, the signal Z gamma of the effect, the columns X of base and other effects, and the
-noise C of the fit. Both terms are sums over whitened blocks of time and the scatter within them. Without each
-recording, the linear model is fitted again, for delta BIC and the largest change of a parameter in standard
-uncertainties (Cook, Technometrics 19, 1977).
+noise C of the fit. Both terms are sums over whitened blocks of time and the scatter within them. Whether the evidence
+depends on one recording follows from linear fits without each: their delta BIC, and the largest change of a parameter
+in standard uncertainties (Cook, Technometrics 19, 1977).
 """
 
 from __future__ import annotations
