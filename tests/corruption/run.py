@@ -100,7 +100,7 @@ def _writable(copy: Copy) -> Copy:
     return copy
 
 
-def by_snakemake(campaign: Path, results: Path, cores: int) -> None:
+def by_snakemake(campaign: Path, results: Path, cores: int = 1) -> None:
     """Calibrate a campaign by the real command."""
     settings = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [Path(sys.executable).with_name("snakemake"), "--cores", cores, "--quiet", "all"]
@@ -111,7 +111,7 @@ def by_snakemake(campaign: Path, results: Path, cores: int) -> None:
         )
 
 
-def run(copies: list[Copy], out: Path, calibrate: Callable[[Path, Path], object]) -> list[Judgement]:
+def run(copies: list[Copy], out: Path, calibrate: Callable[[Path, Path], object] = by_snakemake) -> list[Judgement]:
     """Write the campaign, calibrate it, and judge every unit."""
     campaign = out / "corrupted"
     judgements, rows, kept = [], [], []
