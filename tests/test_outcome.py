@@ -11,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from snakemake.cli import parse_config
 
+from pipeline.core.verdicts import Problem
 from pipeline.output.outcome import (
     _reasons,
     add_command,
     as_overrides,
+    command_of,
     commands_of,
     found_mountings,
     once_command,
@@ -81,6 +83,8 @@ def test_where_an_override_of_all_units_sets_the_effects_the_command_is_for_one_
     command = words(add_command(settings, "U1", ["gyroscope.c", "accelerometer.e"]))
     own = {"U1": ["effects.accelerometer=[d,e]", "effects.gyroscope=[a,c]"]}
     assert parse_config(command[3:]) == settings | {"unit_overrides": own}
+    of_two = command_of(Problem("missing_effect", "", ["U1", "U2"], None, "", ("gyroscope.c",)), settings)
+    assert parse_config(words(of_two)[-2:])["overrides"] == ["filter.order=1"]
     alone = words(add_command(settings, "U2", ["accelerometer.e"]))
     assert alone[:6] == ["-m", "pipeline", "add", "c", "U2", "accelerometer.e"]
 

@@ -339,8 +339,8 @@ def other_axes(moves: Sequence[MoveByHand]) -> tuple[str, Values | None] | None:
     fewest = min(counts)
     if fewest > as_read / CLEARLY_FEWER:
         return None
-    text = f"in {as_read} of {len(moves)} moves between rests gravity turns by more than {FAILS_DEG:g} deg otherwise"
-    text += f" than the angular rates say, and with other axes of the gyroscope in {fewest}"
+    text = f"in {as_read} of {len(moves)} moves between rests the angular rates miss gravity's rotation by more than"
+    text += f" {FAILS_DEG:g} deg, with other axes of the gyroscope in {fewest or 'none'}"
     return text, permutations[counts.index(fewest)] if counts.count(fewest) == 1 else None
 
 
@@ -372,9 +372,16 @@ def _cure(D: Values | None, accelerometer: Values | None, maps: Mapping[str, Seq
     mirrored = np.linalg.det(D) < 0.0
     right = {"accelerometer": now["accelerometer"], "gyroscope": D @ now["gyroscope"]}
     if accelerometer is None:
+        ways = [("gyroscope", right["gyroscope"])]  # a mirrored accelerometer turns as one that is turned
+        ways += [] if mirrored else [("accelerometer", sign * D.T @ now["accelerometer"]) for sign in (-1.0, 1.0)]
+        ways.sort(key=lambda way: int(np.sum(np.any(way[1] != now[way[0]], axis=0))))
+        settings = [f"sensor.{sensor}.axis_map={as_map(matrix)}" for sensor, matrix in ways]
         which = "the gyroscope is mirrored" if mirrored else "one sensor is read in other axes"
-        right = right if mirrored else right | {"accelerometer": D.T @ now["accelerometer"]}
-    elif np.linalg.det(accelerometer) > 0.0:
+        return (
+            f"{which}: gravity agrees with {' or '.join(settings)}; the data sheet shows which is right, and an axis "
+            "of the accelerometer that points up at rest reads +1 g"
+        )
+    if np.linalg.det(accelerometer) > 0.0:
         which = "the gyroscope is mirrored" if mirrored else "the gyroscope is read in other axes"
     elif mirrored:
         which = "both sensors are mirrored"
@@ -386,6 +393,4 @@ def _cure(D: Values | None, accelerometer: Values | None, maps: Mapping[str, Seq
     settings = [f"sensor.{s}.axis_map={as_map(M)}" for s, M in changed.items()]
     if len(changed) == 2 and np.array_equal(right["accelerometer"], right["gyroscope"]):
         settings = [f"sensor.axis_map={as_map(right['gyroscope'])}"]
-    if accelerometer is None:
-        return f"{which}: the data sheet shows which axes are right, and gravity agrees with {' or '.join(settings)}"
     return f"by the faces that are stated {which}: set {' and '.join(settings)}"

@@ -71,6 +71,7 @@ ANGLE_UNITS = (
 )
 TIME_UNIT_FACTORS = tuple((factor, f"{unit} declared as s") for factor, unit in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")))
 TIME_UNIT_FACTORS += ((1e-3, "s declared as ms"),)
+SMALL_HALF_ARC_DEG, FAR_MORE_G = 45.0, 0.5  # half of the angle's range, above which gravity changes by more than 1.4 g
 OTHER_AXIS = 0.5  # the axis that turns reads more than twice as much as one that leans by up to 26 deg
 LEAST_TOTAL_DEG = 1.0  # over a recording, for a ratio
 # relative, between the quartiles of the blocks' ratios: beyond it the channels differ in more than scale
@@ -118,16 +119,15 @@ def check_scale_of_turn(recording: Recording, limits: ChannelLimits) -> None:
     found = {c.name: _in_blocks(c.turned) for c in of_table(recording)}
     angle, rate = found.get("table_angle"), found.get("table_rate")
     ratio = _ratio(rate, angle)
-    if ratio is not None and (not ratio.off(limits.rate) or not ratio.even):
-        return
-    sensors = _turned(recording)
+    agree = ratio is not None and not (ratio.even and ratio.off(limits.rate))
+    sensors = None if agree and not _gravity_turns_further(recording) else _turned(recording)
     if sensors is None:
         return
     gyro, gravity = sensors
     true_angle, true_rate, by_gyro = _ratio(angle, gravity), _ratio(rate, gravity), _ratio(rate, gyro)
     gyro_agrees = by_gyro is not None and by_gyro.agrees(GRAVITY_TOLERANCE)
     tolerance = limits.rate + GRAVITY_TOLERANCE
-    if ratio is not None:
+    if ratio is not None and not agree:
         angle_wrong = ratio.value > 1.0 and gyro_agrees and not ratio.of_time
         if true_angle is not None and true_rate is not None:
             angle_wrong = abs(true_rate.value - 1.0) < abs(true_angle.value - 1.0)
@@ -136,12 +136,21 @@ def check_scale_of_turn(recording: Recording, limits: ChannelLimits) -> None:
         raise _wrong_rate(recording, limits, ratio, "the table's angle", gyro_agrees=gyro_agrees)
     if true_rate is not None and angle is None and true_rate.even and true_rate.off(tolerance):
         raise _wrong_rate(recording, limits, true_rate, "gravity", gyro_agrees=gyro_agrees)
-    if angle is not None and rate is None:
+    if angle is not None and (rate is None or agree):
         if true_angle is not None and true_angle.even and true_angle.off(tolerance):
             raise _wrong_angle(recording, limits, true_angle.value, "gravity")
         factor = _ratio(gyro, angle)
         if factor is not None and factor.of_time:
             raise _wrong_time(recording, limits, factor, "the gyroscope's readings sum up to")
+
+
+def _gravity_turns_further(recording: Recording) -> bool:
+    """Return whether the specific force changes by far more than gravity does over the range of the table's angle."""
+    if recording.table_angle is None or recording.accelerometer is None or not recording.valid.any():
+        return False
+    half = 0.5 * float(np.ptp(recording.table_angle[recording.valid]))
+    change = float(np.max(np.ptp(recording.accelerometer[recording.valid], axis=0)))
+    return half < SMALL_HALF_ARC_DEG and change > 2.0 * np.sin(np.radians(half)) + FAR_MORE_G
 
 
 def _turned(recording: Recording) -> tuple[Values | None, Values | None] | None:

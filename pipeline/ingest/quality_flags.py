@@ -78,6 +78,11 @@ MIN_MEDIAN_MOVES = 3  # for a median
 MOST_MOVES = 40  # bounds the cost
 MAX_ROTATION_SAMPLES = 200_000  # bounds the cost
 FITS_DEG, FAILS_DEG = 15.0, 30.0  # the error of any other possible unit is tens of degrees
+INTERVALS_S = (
+    5e-5,
+    0.5,
+)  # of the samples of a log with moves: no IMU is faster, and none is integrated at less than 2 Hz
+BETWEEN_TIME_UNITS = (1e-3, 1e-6, 1e3, 1e6)  # between s, ms and us
 RANGE_FACTORS = (1 / 8, 1 / 4, 1 / 2, 2.0, 4.0, 8.0)  # between full-scale ranges of a gyroscope, 250 to 2000 deg/s
 
 
@@ -310,6 +315,8 @@ def examine(table: Log, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[
         notes += flag_flat_tops(table, name, flags)
         stuck |= find_stuck(table, name, flags)
     notes += flag_stuck(table, stuck, flags)
+    if not {"table_angle", "table_rate"} & table.values.keys():
+        _check_time_unit(table)
     _check_turn_rate(table)
     return (flags if flags.any() else None), notes
 
@@ -386,7 +393,8 @@ def _check_turn_rate(table: Log) -> None:
             raise IngestError(f"{seen}: the numbers look like {what}", table.path, code="implausible_rate", hint=hint)
     if not {"table_angle", "table_rate"} & table.values.keys():
         what = "the gyroscope has another full-scale range than declared, or the times are wrong by this factor"
-        hint = "correct ingest.csv.columns.gyro_x.unit (gyro_y, gyro_z), or that of time"
+        key = "counts_per_unit" if "gyro_x" in table.count_sizes else "unit"
+        hint = f"correct ingest.csv.columns.gyro_x.{key} (gyro_y, gyro_z), or the unit of the time"
         raise IngestError(f"{seen}: {what}", table.path, code="implausible_rate", hint=hint)
 
 
@@ -478,14 +486,35 @@ def misfits_deg(moves: Sequence[MoveByHand], scales: Sequence[float]) -> Values:
     return np.asarray(np.degrees(np.arccos(np.clip(np.sum(direction * after, axis=2), -1.0, 1.0))))
 
 
-def declared_scale(table: Log) -> tuple[float, str] | None:
-    """Return the factor by which the angular rates are wrong, and the evidence; None if they are right or undecided."""
+def _both_sensors(table: Log) -> tuple[Values, Values, Values] | None:
+    """Return force, (n, 3), rate, (n, 3), and time, (n,), of the first samples; None without both sensors."""
     if not {"accel_x", "gyro_x"} <= table.values.keys():
         return None
     part = slice(0, MAX_ROTATION_SAMPLES)
     force, rate = (np.column_stack([table.values[c][part] for c in TRIADS[s]]) for s in ("accelerometer", "gyroscope"))
-    time_s = (table.time_ns[part] - table.time_ns[0]) / 1e9
-    moves = moves_of(force, rate, time_s)
+    return force, rate, (table.time_ns[part] - table.time_ns[0]) / 1e9
+
+
+def _check_time_unit(table: Log) -> None:
+    """Raise ``IngestError`` if only over times of another unit the rates turn gravity as it is measured."""
+    interval, signals = float(np.median(np.diff(table.time_ns))) / 1e9, _both_sensors(table)
+    shortest, longest = INTERVALS_S
+    if signals is None or shortest <= interval <= longest:
+        return
+    force, rate, time_s = signals
+    for factor in (f for f in BETWEEN_TIME_UNITS if shortest <= interval * f <= longest):
+        moves = moves_of(force, rate, time_s * factor)
+        if len(moves) >= MIN_MEDIAN_MOVES and (misfit := float(misfit_deg(moves, [1.0])[0])) <= FITS_DEG:
+            message = f"the median interval is {interval:g} s; in {len(moves)} moves between rests gravity turns by the"
+            message += f" angle of the rates if the times are multiplied by {factor:g} ({misfit:.1f} deg error)"
+            hint = "correct ingest.csv.columns.time.unit"
+            raise IngestError(message, table.path, code="wrong_rate", hint=hint)
+
+
+def declared_scale(table: Log) -> tuple[float, str] | None:
+    """Return the factor by which the angular rates are wrong, and the evidence; None if they are right or undecided."""
+    signals = _both_sensors(table)
+    moves = [] if signals is None else moves_of(*signals)
     if len(moves) < MIN_MEDIAN_MOVES:
         return None
     scales = (1.0, DEGREES, 1 / DEGREES, *RANGE_FACTORS)

@@ -166,7 +166,8 @@ def command_of(problem: Problem, settings: Mapping[str, Any]) -> str:
         if len(units) == 1:
             return add_command(settings, units[0], problem.effects)
         names = {effect.partition(".")[2] for effect in problem.effects}
-        return _command("add", settings, ["--missing", *(names if len(names) == 1 else ())])
+        others = [text for text in settings.get("overrides") or [] if not EFFECTS_OVERRIDE.fullmatch(text)]
+        return _command("add", {**settings, "overrides": others}, ["--missing", *(names if len(names) == 1 else ())])
     if problem.kind == FAILED:
         return run_command(settings)
     if overrides and len(units) <= NAMED_PER_LINE:

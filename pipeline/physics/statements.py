@@ -266,7 +266,8 @@ def _scale_cause(sensor: str, factors: np.ndarray) -> str:
     unit = next((u for f, u in MISTAKEN_FACTORS[sensor].items() if abs(mean / f - 1.0) < FACTOR_DISTANCE), None)
     if unit is not None:
         return f"readings {mean:.4g} times the truth: they are {unit}; set the unit of their columns in ingest"
-    setting = f"set sensor.{sensor}.full_scale and counts_per_unit"
+    column = "accel_x" if sensor == "accelerometer" else "gyro_x"
+    setting = f"set sensor.{sensor}.range, and counts_per_unit of the columns ({column} ...) if ingest states its own"
     if any(abs(mean / f - 1.0) < FACTOR_DISTANCE for f in RANGE_RATIOS):
         return f"readings {mean:.4g} times the truth: the sensor was set to another range; {setting}"
     return f"readings {mean:.4g} times the truth: the sensor was probably set to another range or unit; {setting}"

@@ -61,7 +61,14 @@ from pipeline.simulation.sensor import (
     drawn_effects,
     drawn_sensors,
 )
-from pipeline.simulation.trajectory import CommandedTurns, Gimbals, Planned, random_errors, rotation_by
+from pipeline.simulation.trajectory import (
+    CommandedTurns,
+    Gimbals,
+    Planned,
+    directions_of_shaft,
+    random_errors,
+    rotation_by,
+)
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
 ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3  # of CSV files: rounding far below any noise
@@ -461,12 +468,14 @@ def _drawn(unit: UnitDescription, streams: Streams) -> tuple[dict[str, Simulated
     def bench_of(other: Mapping[str, Any]) -> SimulatedBench:
         """Return the bench of the description, changed by ``other`` settings; with the same sensors."""
         table = shipped_settings(table=other.get("table", unit.table)).table
-        rng = streams["bench"]
+        rng, stated = streams["bench"], other.get("imperfections", {}) if other else unit.imperfections
+        rate_error, off = rng.standard_normal(3), table.orthogonality_deg * rng.standard_normal((3, 2))
+        one_shaft = table.azimuth_of == "turn_axis"
         imperfections = {
             "angle_accuracy_deg": table.angle_accuracy_deg,
-            "rate_error": table.rate_accuracy * rng.standard_normal(3),
-            "direction_deg": table.orthogonality_deg * rng.standard_normal((3, 2)),
-            **(other.get("imperfections", {}) if other else unit.imperfections),
+            "rate_error": table.rate_accuracy * rate_error,
+            "direction_deg": directions_of_shaft(off[0], stated.get("sense", 1)) if one_shaft else off,
+            **stated,
         }
         given = {s: {**getattr(unit, s), **other.get(s, {})} for s in SENSORS}
         return SimulatedBench(table, imperfections, drawn_sensors(sensor_model, given, effects, streams["unit"]))

@@ -369,6 +369,15 @@ def random_attitudes(count: int, rng: np.random.Generator) -> Values:
     return attitude_matrix(q / np.linalg.norm(q, axis=1, keepdims=True))
 
 
+def directions_of_shaft(off: Values, sense: int) -> Values:
+    """Return the deviations of each turn axis in the body, (3, 2), where one shaft turns the unit about all of them.
+
+    ``off``: (2,), of the shaft along level y and z, in the unit of the result. ``sense``: of its encoder, 1 or -1.
+    """
+    turned = [sense * level_at_zero(axis, shaft=sense).T @ [0.0, *off] for axis in range(3)]
+    return np.array([[u[(axis + 1) % 3], u[(axis + 2) % 3]] for axis, u in enumerate(turned)])
+
+
 def random_errors(program: Program, rng: np.random.Generator, settings: Mapping[str, Any], axis: int) -> TurnErrors:
     """Draw the errors of one recording about an axis of a table.
 

@@ -327,6 +327,9 @@ def cases() -> dict[str, Case]:
             "the median interval is 10 us, .* expects 10000 us; .* a thousand times longer",
             settings={"csv/columns/time/unit": "ms", "checks/rate_hz": 100.0},
         ),
+        "30 by hand": refused(
+            whole, "wrong_rate", "if the times are multiplied by 1000 ", settings={"csv/columns/time/unit": "ms"}
+        ),
         "31": refused(times(unix), "coarse_time", "256 ns apart", settings={"csv/columns/time/unit": "ns"}),
         "32": read(times(wrapping), "N-WRAP", settings={"csv/columns/time/unit": "us"}),
         "32 milliseconds": read(

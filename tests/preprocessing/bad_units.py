@@ -190,6 +190,12 @@ def cases() -> dict[str, Case]:
             "accel_x.csv",
         ),
         "49 angle": Case(at("", of(angle, times(RADIAN))), scale, "table_angle_deg looks like rad declared as deg"),
+        "49 angle and rate": Case(
+            at("accel_x", both(of(angle, times(RADIAN)), of(rate, times(RADIAN)))),
+            scale,
+            "table_angle_deg looks like rad declared as deg.* as far as gravity says",
+            "accel_x.csv",
+        ),
         "49 angle alone": Case(at("", without(rate, of(angle, times(2.0)))), scale, "table_angle_deg is twice"),
         "49 rate by 2 %": Case(at("", of(rate, times(1.02))), note="table_rate_dps is 1.02 times", file="gyro_x.csv"),
         "49 angle and rate by 0.5 %": Case(

@@ -244,6 +244,9 @@ def test_by_hand_gravity_and_the_gyroscope_belong_in_one_frame() -> None:
     )  # gravity's opposite turns alike
     with pytest.raises(IngestError, match=r"gyroscope is mirrored: .*sensor\.gyroscope\.axis_map=\[\+x,\+y,-z\]"):
         check_mounting([_mapped(recording, np.eye(3), MIRROR_Z)], unit_settings.settings_of())
+    exchanged = np.eye(3)[[1, 0, 2]]
+    with pytest.raises(IngestError, match=r"agrees with sensor\.accelerometer\.axis_map=\[\+y,\+x,\+z\] or "):
+        check_mounting([_mapped(recording, exchanged, np.eye(3))], unit_settings.settings_of())
     with pytest.raises(IngestError, match=r"contradict each other: in \d+ of 1\d moves"):
         check_mounting([_mapped(recording, -np.eye(3))], unit_settings.settings_of())
 

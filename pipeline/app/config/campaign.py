@@ -151,7 +151,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
                 problems.setdefault(line, []).append(name)
     if problems:
         lines = [f"  unit {', '.join(shortened(names, 5))}: {text}" for text, names in problems.items()]
-        raise ConfigurationError("the configuration is refused:\n" + "\n".join(lines), str(directory / "units.csv"))
+        raise ConfigurationError("the configuration is refused:\n" + "\n".join(lines), str(directory))
     _check_report_numbers(units, str(directory / "units.csv"))
     of_run = run_settings(layers.of_run)
     batches, chains = cut_batches(units, None if of_run.batch_size == "auto" else of_run.batch_size)
