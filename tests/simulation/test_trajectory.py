@@ -8,13 +8,14 @@ import pytest
 
 from pipeline.core.records import attitude_matrix
 from pipeline.ingest.clock_alignment import Program
-from pipeline.physics.kinematics import UP_AT_ZERO, turn_about_axis
+from pipeline.physics.kinematics import UP_AT_ZERO, level_at_zero, turn_about_axis
 from pipeline.simulation.description import Course, plan
 from pipeline.simulation.trajectory import (
     CommandedTurns,
     RestsAndMoves,
     TurnErrors,
     axis_and_angle,
+    directions_of_shaft,
     random_gimbals,
     rest,
     rotation_about,
@@ -152,3 +153,11 @@ def test_the_24_orientations_are_eight_about_each_axis() -> None:
         first, second = level[:, (axis + 1) % 3], level[:, (axis + 2) % 3]
         steps = np.diff(np.unwrap(np.arctan2(second, first)))
         np.testing.assert_allclose(np.abs(np.degrees(steps)), 45.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_one_shaft_has_one_direction_in_the_room_in_the_turns_about_all_axes(sense: int) -> None:
+    directions = directions_of_shaft(np.array([0.01, -0.02]), sense)
+    for axis in range(3):
+        shaft = level_at_zero(axis, shaft=sense) @ TurnErrors(direction=directions[axis]).turn_axis(axis)
+        np.testing.assert_allclose(sense * shaft, np.array([1.0, 0.01, -0.02]) / np.linalg.norm([1.0, 0.01, -0.02]))
