@@ -42,7 +42,7 @@ def marked(model: str, sensor: str, K: np.ndarray, bias: float = 0.0, sigma: flo
             2.0,
             "was set to another range; set sensor.accelerometer.range, and counts_per_unit of the columns",
         ),
-        ("gyroscope", 0.25, "was set to another range; set sensor.gyroscope.range, and counts_per_unit of the columns"),
+        ("gyroscope", 0.25, "was set to another range; set sensor.gyroscope.range, and counts_per_unit of the"),
         ("gyroscope", 1.55, "was probably set to another range or unit"),
         ("accelerometer", 0.45, "was probably set to another range or unit"),
         ("accelerometer", 9.80665, "in m/s^2, and read as g"),
