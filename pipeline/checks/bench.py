@@ -372,7 +372,8 @@ def _cure(D: Values | None, accelerometer: Values | None, maps: Mapping[str, Seq
     mirrored = np.linalg.det(D) < 0.0
     right = {"accelerometer": now["accelerometer"], "gyroscope": D @ now["gyroscope"]}
     if accelerometer is None:
-        ways = [("gyroscope", right["gyroscope"])]  # a mirrored accelerometer turns as one that is turned
+        ways = [("gyroscope", right["gyroscope"])]
+        # the rotation of gravity is the same for either sign of the accelerometer
         ways += [] if mirrored else [("accelerometer", sign * D.T @ now["accelerometer"]) for sign in (-1.0, 1.0)]
         ways.sort(key=lambda way: int(np.sum(np.any(way[1] != now[way[0]], axis=0))))
         settings = [f"sensor.{sensor}.axis_map={as_map(matrix)}" for sensor, matrix in ways]

@@ -71,7 +71,8 @@ ANGLE_UNITS = (
 )
 TIME_UNIT_FACTORS = tuple((factor, f"{unit} declared as s") for factor, unit in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")))
 TIME_UNIT_FACTORS += ((1e-3, "s declared as ms"),)
-SMALL_HALF_ARC_DEG, FAR_MORE_G = 45.0, 0.5  # half of the angle's range, above which gravity changes by more than 1.4 g
+# half of a turn's angle, from which gravity changes by up to 1.4 g; a change beyond gravity's that is no vibration
+SMALL_HALF_ARC_DEG, FAR_MORE_G = 45.0, 0.5
 OTHER_AXIS = 0.5  # the axis that turns reads more than twice as much as one that leans by up to 26 deg
 LEAST_TOTAL_DEG = 1.0  # over a recording, for a ratio
 # relative, between the quartiles of the blocks' ratios: beyond it the channels differ in more than scale

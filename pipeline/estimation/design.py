@@ -213,6 +213,10 @@ def ordinary_base(observations: Observations, noise: Noise | None) -> Start:
     return Start(beta[0], beta[1:].T, np.maximum(scale, 1e-6 * largest))
 
 
+def _norms(weight: Values, columns: Values) -> Values:
+    return np.asarray(np.sqrt(np.einsum("i,ij,ij->j", weight, columns, columns)))
+
+
 class Design:
     """Products of base, terms and readings under noise settings.
 
@@ -241,7 +245,7 @@ class Design:
         self._fill(A, observations, terms, K)
         if base is not None:
             A[:, 1:4] = base
-        self.size = np.sqrt(np.einsum("i,ij,ij->j", weight, A, A))
+        self.size = _norms(weight, A)
         if project:
             root = np.sqrt(weight)[:, None]
             Q, R = np.linalg.qr(root * A[:, :4])
@@ -256,7 +260,7 @@ class Design:
         """Return the design of the same rows with other weights."""
         found, blocks, weight = copy(self), observations.blocks, observations.weight
         found.columns = Products(blocks, weight, self.columns.columns)
-        found.size = np.sqrt(np.einsum("i,ij,ij->j", weight, found.columns.columns, found.columns.columns))
+        found.size = _norms(weight, self.columns.columns)
         return found
 
     def _errors_of_stops(self, observations: Observations, terms: Terms, K: Values) -> list[scipy.sparse.csr_array]:

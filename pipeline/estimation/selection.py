@@ -161,10 +161,7 @@ class Selection:
             part.moved.clear()
 
     def without(self, names: Collection[str]) -> Selection | None:
-        """Return the selection by the other candidates; None without one, or where its 2 log L is clearly less.
-
-        2 log L may be less by ``MIN_DELTA_BIC``.
-        """
+        """Return the selection by the other candidates; None if empty, or its 2 log L is less by ``MIN_DELTA_BIC``."""
         others = {name: term for name, term in self.candidates.items() if name not in names}
         found = replace(self, steps={}, fits=dict(self.fits), fit=self.base, ranking=self.first, candidates=others)
         found.run()

@@ -78,10 +78,8 @@ MIN_MEDIAN_MOVES = 3  # for a median
 MOST_MOVES = 40  # bounds the cost
 MAX_ROTATION_SAMPLES = 200_000  # bounds the cost
 FITS_DEG, FAILS_DEG = 15.0, 30.0  # the error of any other possible unit is tens of degrees
-INTERVALS_S = (
-    5e-5,
-    0.5,
-)  # of the samples of a log with moves: no IMU is faster, and none is integrated at less than 2 Hz
+INTERVALS_S = 5e-5, 0.5  # between samples of an IMU: others cannot be integrated over moves of a second
+TURN_CHANNELS = {"table_angle", "table_rate"}  # with them, other checks compare the rates in scale
 BETWEEN_TIME_UNITS = (1e-3, 1e-6, 1e3, 1e6)  # between s, ms and us
 RANGE_FACTORS = (1 / 8, 1 / 4, 1 / 2, 2.0, 4.0, 8.0)  # between full-scale ranges of a gyroscope, 250 to 2000 deg/s
 
@@ -315,7 +313,7 @@ def examine(table: Log, sensor: Sensor | None, checks: Checks) -> tuple[NDArray[
         notes += flag_flat_tops(table, name, flags)
         stuck |= find_stuck(table, name, flags)
     notes += flag_stuck(table, stuck, flags)
-    if not {"table_angle", "table_rate"} & table.values.keys():
+    if not TURN_CHANNELS & table.values.keys():
         _check_time_unit(table)
     _check_turn_rate(table)
     return (flags if flags.any() else None), notes
@@ -391,7 +389,7 @@ def _check_turn_rate(table: Log) -> None:
         if NEAR < ratio / factor < 1 / NEAR:
             hint = "correct ingest.csv.columns.gyro_x.unit (gyro_y, gyro_z)"
             raise IngestError(f"{seen}: the numbers look like {what}", table.path, code="implausible_rate", hint=hint)
-    if not {"table_angle", "table_rate"} & table.values.keys():
+    if not TURN_CHANNELS & table.values.keys():
         what = "the gyroscope has another full-scale range than declared, or the times are wrong by this factor"
         key = "counts_per_unit" if "gyro_x" in table.count_sizes else "unit"
         hint = f"correct ingest.csv.columns.gyro_x.{key} (gyro_y, gyro_z), or the unit of the time"
@@ -497,9 +495,9 @@ def _both_sensors(table: Log) -> tuple[Values, Values, Values] | None:
 
 def _check_time_unit(table: Log) -> None:
     """Raise ``IngestError`` if only over times of another unit the rates turn gravity as it is measured."""
-    interval, signals = float(np.median(np.diff(table.time_ns))) / 1e9, _both_sensors(table)
-    shortest, longest = INTERVALS_S
-    if signals is None or shortest <= interval <= longest:
+    interval, (shortest, longest) = interval_of(np.diff(table.time_ns)) / 1e9, INTERVALS_S
+    signals = None if shortest <= interval <= longest else _both_sensors(table)
+    if signals is None:
         return
     force, rate, time_s = signals
     for factor in (f for f in BETWEEN_TIME_UNITS if shortest <= interval * f <= longest):

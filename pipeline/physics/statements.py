@@ -39,6 +39,7 @@ from typing import Any
 
 import numpy as np
 
+from imu_logs.units import TRIADS
 from pipeline.core.errors import ConfigurationError, shortened
 from pipeline.core.records import (
     AXES,
@@ -266,7 +267,7 @@ def _scale_cause(sensor: str, factors: np.ndarray) -> str:
     unit = next((u for f, u in MISTAKEN_FACTORS[sensor].items() if abs(mean / f - 1.0) < FACTOR_DISTANCE), None)
     if unit is not None:
         return f"readings {mean:.4g} times the truth: they are {unit}; set the unit of their columns in ingest"
-    column = "accel_x" if sensor == "accelerometer" else "gyro_x"
+    column = TRIADS[sensor][0]
     setting = f"set sensor.{sensor}.range, and counts_per_unit of the columns ({column} ...) if ingest states its own"
     if any(abs(mean / f - 1.0) < FACTOR_DISTANCE for f in RANGE_RATIOS):
         return f"readings {mean:.4g} times the truth: the sensor was set to another range; {setting}"

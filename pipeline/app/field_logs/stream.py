@@ -69,9 +69,8 @@ class LogProfile:
     """The layout of the logs of a unit."""
 
     ingest: Ingest = CANONICAL_CSV
-    axis_maps: Mapping[str, Sequence[str]] = field(
-        default_factory=dict
-    )  # sensor to the body axes that its axes point along
+    # sensor to the body axes that its axes point along
+    axis_maps: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @classmethod
     def of_calibration(cls, document: Mapping[str, Any], file: str) -> LogProfile:

@@ -180,8 +180,7 @@ def findings(case: DiagnosisInput) -> Findings:
     Held-out motion and limits distinguish sets that the turns do not. Where a selected effect raises the held-out
     error, another set that explains as much and raises none takes the place of the selection; where one is beyond its
     limits, another one that is plausible and better by a delta BIC of ``MIN_DELTA_BIC``, which the search had missed.
-    Neither this nor the probability of whole sets changes a selection that leaves twice the noise: no set explains the
-    turns then, and the likelihoods of sets differ by far more than any effect of the sensor explains.
+    A selection that leaves twice the noise stays as it is: no set of the catalogue explains such turns.
     Raises ``NotObservableError`` if the recordings do not determine bias and matrix.
     """
     observations = observe(case.sensor, case.recordings, case.settings.table)
