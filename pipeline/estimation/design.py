@@ -20,19 +20,18 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import partial, reduce
+from functools import cached_property, partial, reduce
 from itertools import groupby, pairwise
 from typing import Any, TypeAlias
 
 import numpy as np
-import scipy
 
 from pipeline.core.errors import InputError, NotObservableError
 from pipeline.core.records import BASE_COUNT, DEFERRED, MATRIX_ROWS, Index, Motion, Noise, Values, motion_at_rest
 from pipeline.estimation.engine import LinearMap, ScaledColumns, scaled_inverse
 from pipeline.estimation.gauss_markov import Products, Setting
 from pipeline.estimation.observations import Observations, RecordingRows, without_rows
-from pipeline.estimation.table_errors import errors_of_stops
+from pipeline.estimation.table_errors import StopErrors, errors_of_stops
 from pipeline.physics.effects.base import Effect, Layout, truth
 from pipeline.physics.effects.formula_effect import FormulaEffect
 
@@ -252,7 +251,7 @@ class Design:
             inner = Q.T @ (root * A[:, 4:])
             A[:, 4:] -= A[:, :4] @ np.linalg.solve(R, inner)
         self.columns = Products(observations.blocks, weight, A)
-        self.stops = self._errors_of_stops(observations, terms, K) if observations.angle_deg > 0.0 else []
+        self._changes = self._by_stops(observations, terms, K) if observations.angle_deg > 0.0 else None
         self._from = [np.add.outer(at * self._width, at).ravel() for at in self._local]
         self._to = [np.add.outer(index * (self.count + 1), index).ravel() for index in self._total]
 
@@ -260,16 +259,24 @@ class Design:
         """Return the design of the same rows with other weights."""
         found, blocks, weight = copy(self), observations.blocks, observations.weight
         found.columns = Products(blocks, weight, self.columns.columns)
+        found.__dict__.pop("_stops", None)
         found.size = _norms(weight, self.columns.columns)
         return found
 
-    def _errors_of_stops(self, observations: Observations, terms: Terms, K: Values) -> list[scipy.sparse.csr_array]:
-        """Return the columns of the errors of the angle, one for each stop and of unit variance, for each axis."""
+    def _by_stops(self, observations: Observations, terms: Terms, K: Values) -> tuple[Values, Values, Index, int]:
+        """Return what errors of the angle of unit variance change, over the noise (``StopErrors``)."""
         motions = [true_motion(part, terms) for part in observations.parts]
         before, after, stop, last = errors_of_stops(observations.sensor, motions, K)
-        change = observations.angle_deg * np.concatenate([before, after])
-        places, shape = (np.tile(np.arange(len(stop)), 2), np.append(stop, stop + 1)), (len(stop), last + 1)
-        return [scipy.sparse.csr_array((of_axis, places), shape) for of_axis in change.T]
+        unit = observations.angle_deg / self.scale
+        return unit * before, unit * after, stop, last + 1
+
+    @cached_property
+    def _stops(self) -> tuple[StopErrors, Values] | None:
+        """The errors of the angle at the stops, and the sums of the columns over them; None if noise hides them."""
+        if self._changes is None:
+            return None
+        found = StopErrors(self.columns, *self._changes)
+        return found, found.sums(self.scale, [*map(self.places, range(3))], self.count + 1)
 
     def _place(self, sensor: str, terms: Terms) -> None:
         """Assign to each axis its columns of A, and the parameter of each column."""
@@ -333,72 +340,53 @@ class Design:
 
         The priors are added, and errors of the angle are eliminated. ``log det C`` lacks a constant.
         """
-        own, logarithms = self._without_stops(settings)
-        if not self.stops:
-            return own, logarithms
-        cross, inner = self._with_stops(settings)
-        factor = np.linalg.cholesky(inner)
-        for i, (L, products) in enumerate(zip(factor, cross, strict=True)):
-            half = scipy.linalg.solve_triangular(L, products, lower=True, check_finite=False)
-            own[i] -= half.T @ half
-        return own, logarithms + 2.0 * np.sum(np.log(np.einsum("gss->gs", factor)), axis=1)
-
-    def _without_stops(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
-        """Return ``products`` as if the angle had no errors at the stops."""
-        last, count = self.count, self.count + 1
-        of_columns, logarithms = self.columns.products(settings)
-        of_columns, total = of_columns.reshape(len(settings), -1), np.zeros((len(settings), count**2))
-        for to, at, scale in zip(self._to, self._from, self.scale, strict=True):
-            total[:, to] += of_columns.take(at, 1) / scale**2
-        square = total.reshape(-1, count, count)
+        if self._stops:
+            stops, sums = self._stops
+            square, logarithms = stops.products(settings, self._of_axes(self.columns.white[None])[0], sums)
+        else:
+            of_columns, of_one = self.columns.products(settings)
+            square, logarithms = self._of_axes(of_columns), 3.0 * of_one
+        last = self.count
         for at, term, prior in self._priors:  # as readings of the parameters themselves
             rest = prior.mean - term.values
             square[:, at, at] += prior.precision
             square[:, at, last] += prior.precision @ rest
             square[:, last, at] += prior.precision @ rest
             square[:, last, last] += rest @ prior.precision @ rest
-        return square, 3.0 * logarithms
+        return square, logarithms
 
-    def _with_stops(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
-        """Return the products of the s columns of stops with the parameters', (g, s, p + 1), and ``1 + T^T C^-1 T``."""
-        of_rows, blocks, s = self.columns, self.columns.blocks, self.stops[0].shape[1]
-        weight, of_blocks = (scipy.sparse.diags_array(w) for w in (of_rows.weight, 1.0 / blocks.weight))
-        n, model = len(of_rows.weight), blocks.model(tuple(settings))
-        sums = scipy.sparse.csr_array((of_rows.weight, (blocks.label(n), np.arange(n))))  # over the rows of each block
-        whitened = model.whitened(of_rows.means)
-        cross, inner = np.zeros((len(settings), s, self.count + 1)), np.tile(np.eye(s), (len(settings), 1, 1))
-        for T, local, total, scale in zip(self.stops, self._local, self._total, self.scale, strict=True):
-            of_stops, columns, means = sums @ T, of_rows.columns[:, local], of_rows.means[:, local]
-            own = model.whitened((of_blocks @ of_stops).toarray() / scale)
-            inner += (T.T @ weight @ T - of_stops.T @ of_blocks @ of_stops).toarray() / scale**2
-            inner += own @ own.transpose(0, 2, 1)
-            within = (T.T @ (weight @ columns) - of_stops.T @ means) / scale**2
-            cross[:, :, total] += within + own @ whitened[:, local].transpose(0, 2, 1) / scale
-        return cross, inner
+    def _of_axes(self, of_columns: Values) -> Values:
+        """Return the sum of the axes' products, (g, p + 1, p + 1), by those of all columns, (g, q, q)."""
+        of_columns, count = of_columns.reshape(len(of_columns), -1), self.count + 1
+        total = np.zeros((len(of_columns), count**2))
+        for to, at, scale in zip(self._to, self._from, self.scale, strict=True):
+            total[:, to] += of_columns.take(at, 1) / scale**2
+        return total.reshape(-1, count, count)
 
     def linear_map(self, setting: Setting) -> LinearMap:
         """Return the linear map from small changes of the readings to the parameters, under a noise setting."""
         inverse, weights, derivative = self._inverse(setting), [], []
-        influence, stops = self.columns.influence(setting), np.arange(self.count, len(inverse))
-        rows = self.columns.blocks, self.columns.weight
-        of_stops = [Products(*rows, T.toarray()).influence(setting) for T in self.stops] or [influence[:0]] * 3
-        for own, local, total, scale in zip(of_stops, self._local, self._total, self.scale, strict=True):
-            weights.append(np.concatenate([influence[local[:-1]], own]))  # without the readings, which are last
-            derivative.append(inverse[: self.count, np.append(total[:-1], stops)] / scale**2)
+        if self._stops:  # they couple the axes
+            stops, sums = self._stops
+            for c, explained in enumerate(stops.explained(setting, sums[:, :-1])):
+                own = self.of_axis(c)[:, :-1] / self.scale[c]
+                explained[:, self._total[c][:-1]] -= self.columns.weight[:, None] * own
+                weights.append(explained.T / -self.scale[c])
+            return LinearMap(tuple(weights), (inverse,) * 3)
+        influence = self.columns.influence(setting)
+        for local, total, scale in zip(self._local, self._total, self.scale, strict=True):
+            weights.append(influence[local[:-1]])  # without the readings, which are last
+            derivative.append(inverse[:, total[:-1]] / scale**2)
         return LinearMap(tuple(weights), tuple(derivative))
 
     def prior_covariances(self, setting: Setting) -> dict[str, Values]:
         """Return the contribution of each effect's prior to the covariance of the parameters: (p, p) arrays."""
-        inverse = self._inverse(setting)[: self.count, : self.count]
+        inverse = self._inverse(setting)
         return {t.effect.name: inverse[:, at] @ prior.precision @ inverse[at] for at, t, prior in self._priors}
 
     def _inverse(self, setting: Setting) -> Values:
-        """Return the inverse of the products of the columns of parameters and stops: (q, q) array."""
-        gram = self._without_stops([setting])[0][0, : self.count, : self.count]
-        if self.stops:
-            (cross,), (inner,) = self._with_stops([setting])
-            gram = np.block([[gram, cross[:, :-1].T], [cross[:, :-1], inner]])
-        return scaled_inverse(gram)
+        """Return the inverse of the products of the parameters' columns: (p, p) array."""
+        return scaled_inverse(self.products([setting])[0][0, :-1, :-1])
 
     def sizes(self) -> Values:
         """Return the norm of each parameter's column before the projection: (p + 1,) array."""

@@ -25,11 +25,12 @@ from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
+from scipy.linalg import lapack
 
-from pipeline.core.records import NORMAL, SENSORS, Contribution, Index, Motion, Values, noise_of_steps
+from pipeline.core.records import NORMAL, SENSORS, Contribution, Index, Integers, Motion, Values, noise_of_steps
 from pipeline.core.settings import Table
 from pipeline.estimation.engine import LinearMap, ResidualNoise, assess_noise
-from pipeline.estimation.gauss_markov import Blocks, WanderPrior
+from pipeline.estimation.gauss_markov import Blocks, Products, Setting, WanderPrior
 from pipeline.physics.effects import effect
 from pipeline.physics.effects.base import truth
 from pipeline.physics.kinematics import ABOUT, earth_of
@@ -40,6 +41,7 @@ BudgetLines: TypeAlias = "tuple[list[Contribution], dict[str, str]]"
 
 INPUT_EFFECT_ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ
+LEAST_CHANGE = 1e-9  # of the bias's variance, between blocks at one time: there its precision would be infinite
 COUNTED_STOPS = 4  # stops of a recording above which its steps are counted, so that the rate adds no error
 TILT_ACCURACIES = ("angle_accuracy_deg", "orthogonality_deg", "wobble_deg", "levelling_deg")
 
@@ -257,6 +259,107 @@ def errors_of_stops(sensor: str, motions: Sequence[Motion], K: Values) -> tuple[
         index.append(stop + count)
         count += stops
     return np.concatenate(before), np.concatenate(after), np.concatenate(index), count
+
+
+class StopErrors:
+    """Errors of the angle at the stops and the bias of the blocks, eliminated from a fit together.
+
+    Over the white noise of axis c, its readings are
+
+        y_c = A_c p + S x_c + T_c e + w_c,    x_c ~ N(0, q B),    e ~ N(0, 1),    w_c ~ N(0, W^-1)
+
+    where S has a 1 in each row at its block, T_c is the change by the error of each stop, W the samples of the rows,
+    and q B as in ``pipeline.estimation.gauss_markov``. With M, the precision of (x, e) at given parameters p,
+
+        A^T C^-1 A = A^T W A - Z^T M^-1 Z,    Z = [S, T]^T W A,    log det C = log det M + 3 log det(q B)
+
+    In the order of time M is a band matrix: a reading depends on one block and two stops, and the bias at an instant
+    on the one before it. ``before``, ``after``: (n, 3), the changes of ``errors_of_stops`` for errors of unit variance.
+    """
+
+    def __init__(self, rows: Products, before: Values, after: Values, stop: Index, count: int) -> None:
+        blocks, weight = rows.blocks, rows.weight
+        assert not blocks.length.any()  # noqa: S101  (only the bias at instants is a Markov process)
+        self._rows, self._change, self._stop = rows, (before, after), stop
+        self._label, order, ends = blocks.label(len(weight)), blocks.order, np.concatenate([stop, stop + 1])
+        rank = np.argsort(order)
+        of_row, change, doubled = np.tile(rank[self._label], 2), np.concatenate(self._change), np.tile(weight, 2)
+        middle = np.bincount(ends, of_row, count) / np.maximum(np.bincount(ends, minlength=count), 1)
+        place = np.argsort(np.argsort(np.append(np.repeat(np.arange(len(order)), 3), middle), kind="stable"))
+        self._bias, self._errors = place[: 3 * len(order)].reshape(-1, 3), place[3 * len(order) :]  # in M; in time
+        pairs, pair = np.unique(of_row * count + ends, return_inverse=True)  # of a block and a stop
+        block, error = self._bias[pairs // count], self._errors[pairs % count]
+        of_turn = np.bincount(stop, weight * np.sum(before * after, axis=1), count)
+        turns = np.flatnonzero(of_turn)
+        turn = self._errors[turns], self._errors[turns + 1]
+        links = [(block, error[:, None]), turn, (self._bias[:-1], self._bias[1:])]
+        width = max(int(np.abs(a - b).max(initial=0)) for a, b in links)
+        self._alone = np.zeros((width + 1, len(place)))  # lower band of M without bias
+        self._alone[0, self._errors] = 1.0 + np.bincount(ends, doubled * np.sum(change**2, axis=1), count)
+        _add(self._alone, turn[0], turn[1], of_turn[turns].astype(float))
+        self._both = self._alone.copy()  # of M without the prior of the bias
+        self._both[0, self._bias] = blocks.weight[order, None]
+        self._alone[0, self._bias] = 1.0
+        for c in range(3):
+            _add(self._both, block[:, c], error, np.bincount(pair, doubled * change[:, c]).astype(float))
+        same = np.diff(blocks.clock[order]) == 0
+        self._order, self._apart = order, np.where(same, np.diff(blocks.start[order]), np.inf)
+
+    def products(self, settings: Sequence[Setting], white: Values, sums: Values) -> tuple[Values, Values]:
+        """Return ``A^T C^-1 A``, (g, p, p), and ``log det C``, (g,); ``white``: ``A^T W A``; ``sums``: of ``sums``."""
+        found, logarithms = np.empty((len(settings), *white.shape)), np.empty(len(settings))
+        for i, setting in enumerate(settings):
+            factor, logarithms[i], of_setting = self._factor(setting, sums)
+            half, info = lapack.dtbtrs(factor, of_setting, uplo="L")
+            assert info == 0  # noqa: S101
+            found[i] = white - half.T @ half
+        return found, logarithms
+
+    def sums(self, scale: Values, of_axis: Sequence[tuple[Index, Index]], count: int) -> Values:
+        """Return Z: (3 m + s, p) array; ``of_axis``: the columns of each axis, and their places among ``count``."""
+        of_stops, found = np.zeros((len(self._errors), count)), np.zeros((self._both.shape[1], count), order="F")
+        first = np.flatnonzero(np.diff(self._stop, prepend=-1))
+        of_blocks = (self._rows.blocks.weight[:, None] * self._rows.means)[self._order]
+        for c, (local, at) in enumerate(of_axis):
+            columns = (self._rows.weight / scale[c])[:, None] * self._rows.columns.take(local, 1)
+            found[self._bias[:, c, None], at] = of_blocks.take(local, 1) / scale[c]
+            for change, stops in zip(self._change, (self._stop[first], self._stop[first] + 1), strict=True):
+                of_stops[stops[:, None], at] += np.add.reduceat(change[:, c, None] * columns, first, axis=0)
+        found[self._errors] = of_stops
+        return found
+
+    def explained(self, setting: Setting, sums: Values) -> list[Values]:
+        """Return ``W (S x_c + T_c e)``, (n, p), of each axis, with the expected bias and errors by the readings A."""
+        factor, _, of_setting = self._factor(setting, sums)
+        solved, info = lapack.dpbtrs(factor, of_setting, lower=1)
+        assert info == 0  # noqa: S101
+        errors, bias = solved[self._errors], np.empty((len(self._order), 3, solved.shape[1]))
+        bias[self._order] = solved[self._bias] * (setting.ratio > 0.0)
+        before, after = self._change
+        moved = (before[:, c, None] * errors[self._stop] + after[:, c, None] * errors[self._stop + 1] for c in range(3))
+        return [self._rows.weight[:, None] * (bias[self._label, c] + by_stops) for c, by_stops in enumerate(moved)]
+
+    def _factor(self, setting: Setting, sums: Values) -> tuple[Values, float, Values]:
+        """Return the Cholesky factor of M as a band, ``log det C``, and Z as far as M couples it to parameters."""
+        if setting.ratio > 0.0:
+            step = self._apart / setting.time
+            inner = np.append(np.inf, step)
+            # of each bias, given the one before it
+            variance = setting.ratio**2 * np.maximum(-np.expm1(-2.0 * inner), LEAST_CHANGE)
+            carried, band, logarithm = np.exp(-step), self._both.copy(), 3.0 * float(np.sum(np.log(variance)))
+            band[0, self._bias] += (1.0 / variance + np.append(carried**2 / variance[1:], 0.0))[:, None]
+            _add(band, self._bias[:-1], self._bias[1:], -(carried / variance[1:])[:, None])
+        else:
+            band, logarithm, sums = self._alone.copy(), 0.0, sums.copy()
+            sums[self._bias] = 0.0
+        factor, info = lapack.dpbtrf(band, lower=1, overwrite_ab=1)
+        assert info == 0  # noqa: S101  (M is a precision)
+        return factor, logarithm + 2.0 * float(np.sum(np.log(factor[0]))), sums
+
+
+def _add(band: Values, one: Integers, two: Integers, values: Values) -> None:
+    """Add elements of a symmetric matrix, each once, to its lower band."""
+    band[np.abs(one - two), np.minimum(one, two)] += values
 
 
 def between_stops(angle: Values, rate: Values) -> tuple[Index, Values, Values, int]:
