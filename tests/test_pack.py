@@ -1,6 +1,7 @@
 """Packs: what is read is what was written, or refused, whatever happened to the file."""
 
 from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import pytest
 from hypothesis import given, settings
@@ -29,8 +30,17 @@ def test_members_are_read_as_they_were_written_and_written_the_same_again(tmp_pa
     assert "U2.json" not in pack
 
 
-def test_files_that_are_published_one_by_one_are_not_deflated(tmp_path: Path) -> None:
-    with new_pack(tmp_path / "report.zip", deflated=False) as add:
+def test_files_that_were_deflated_by_the_version_before_are_read(tmp_path: Path) -> None:
+    with ZipFile(tmp_path / "report.zip", "w", ZIP_DEFLATED) as archive:
+        archive.writestr("U1.html", as_bytes(FILES["U1.html"]))
+    pack = Pack(tmp_path / "report.zip")
+    assert (pack.names(), pack.read("U1.html")) == (["U1.html"], as_bytes(FILES["U1.html"]))
+    assert "U1.html" in pack
+    assert pack.digest("U1.html") == Pack(write_pack(tmp_path / "new.zip", FILES)).digest("U1.html")
+
+
+def test_files_that_are_published_one_by_one_are_not_compressed(tmp_path: Path) -> None:
+    with new_pack(tmp_path / "report.zip", compressed=False) as add:
         add({name: as_bytes(FILES[name]) for name in ("U1.html", "U1.json")})
     assert as_bytes(FILES["U1.html"]) in (tmp_path / "report.zip").read_bytes()
     assert Pack(tmp_path / "report.zip").read("U1.html") == as_bytes(FILES["U1.html"])

@@ -254,7 +254,9 @@ class Blocks:
 
     def sums(self, columns: Values) -> Values:
         """Return the sums of (n, p) columns over each block: (m, p) array."""
-        return np.add.reduceat(columns, self.first, axis=0)
+        ends = np.append(self.first, len(columns))
+        of_rows = scipy.sparse.csr_array((np.ones(len(columns)), np.arange(len(columns)), ends))  # faster than reduceat
+        return np.asarray(of_rows @ columns)
 
     def covariance(self, tau: float | Values) -> Values:
         """Return B: (m, m) array, or (t, m, m) for (t,) correlation times."""

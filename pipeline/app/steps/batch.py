@@ -111,7 +111,7 @@ def main(stage: str, argv: Sequence[str]) -> int:
         return 0
     edited = job.run.get("again", 0) != repetitions(job.results, _below(job, job.output))[0]
     last = None if edited else Pack(last_output(job.output))
-    with new_pack(job.output, deflated=job.run.get("packed", True)) as add:
+    with new_pack(job.output, compressed=job.run.get("packed", True)) as add:
         for number, (unit, settings) in enumerate(job.units.items(), 1):
             print(f"{stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
             inputs = _inputs_of(module, job, unit, settings)
