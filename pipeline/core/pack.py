@@ -4,7 +4,7 @@ The CRC-32 of a member is checked at each reading. Members have no time, so equa
 
 Up to ``publish_limit`` units, the files of each unit are published one by one, and packs hold them as they are. Above
 it the packs of each batch are published (``packs/<batch>/``), and ``unpack`` publishes the files of a unit on request.
-Text is then compressed by Zstandard (a member ``NAME.zst``): a page of 513 kB to 195 kB in 1.2 ms, where deflation takes
+Text is then compressed by Zstandard (member ``NAME.zst``): a page of 513 kB to 195 kB in 1.2 ms, where deflation takes
 5.6 ms to 216 kB; it is decompressed in 0.4 ms.
 """
 
