@@ -19,6 +19,7 @@ MARK_ABOVE_FLOORS = 3.0  # error over noise floor above which a unit is marked, 
 # with its g-sensitivity left out, else by 1.7
 MARK_AFTER_MOVES = 5.0
 FAILED, INCOMPLETE, IMPLAUSIBLE, NOT_HELD_OUT = "failed", "incomplete", "implausible", "not_held_out"
+NOT_CONVERGED, WORSE_THAN_RAW = "not_converged", "worse_than_raw"
 FAR, BEYOND_ACCEPTANCE, READY = "far_above_noise", "beyond_acceptance", "ready"
 SETTING = re.compile(r"\(([a-z_.]+=\w+)\)")  # a setting within a next step
 FIGURES = {  # what decides a verdict: in the words of pages, index, terminal and ``summary.csv``, and its size
@@ -79,6 +80,14 @@ KINDS = {  # the most urgent first
     INCOMPLETE: Kind(
         "not complete", "a stage after the fit failed; the calibration does not depend on it",
         "read the cause on the unit's page", "bad",
+    ),
+    WORSE_THAN_RAW: Kind(
+        "worse than raw", "the fit has a larger held-out error than the raw readings: the sensor is not calibrated",
+        "read the cause on the unit's page", "bad",
+    ),
+    NOT_CONVERGED: Kind(
+        "not converged", "the fit did not converge: parameters and uncertainties are in doubt",
+        "record more, or fit fewer effects", "bad",
     ),
     Verdict.MISSING_EFFECT: Kind("effect missing", "the model lacks an effect that the recordings show", "add it"),
     IMPLAUSIBLE: Kind(
@@ -209,7 +218,9 @@ def _kinds(row: Mapping[str, Any], errors: Mapping[str, Error]) -> dict[str, lis
         quiet = verdict in (Verdict.NOTHING_MISSING, Verdict.NOT_ENOUGH_DATA)
         kinds = [] if verdict == Verdict.NOTHING_MISSING else [str(verdict)]
         kinds += [FAR] * bool(quiet and ((ratio or 0.0) > MARK_ABOVE_FLOORS or _far_after_moves(row, sensor)))
-        kinds += [kind for kind in (IMPLAUSIBLE, NOT_HELD_OUT) if row.get(f"{sensor}_{kind}")]
+        kinds += [
+            kind for kind in (WORSE_THAN_RAW, NOT_CONVERGED, IMPLAUSIBLE, NOT_HELD_OUT) if row.get(f"{sensor}_{kind}")
+        ]
         for kind in kinds:
             found.setdefault(kind, []).append(sensor)
     return {kind: found[kind] for kind in KINDS if kind in found} if len(found) > 1 else found

@@ -87,7 +87,8 @@ class CampaignResults:
         ``<sensor>_error_before``, ``_error_after`` (rms), ``_mean_abs_before``, ``_mean_abs_after``, ``_noise_floor``
         (g or deg/s), ``_verdict``, ``_selected`` (missing effects, joined by ";"), ``_reason``, ``_answers`` (number of
         answers in the answer set), ``_beyond_limits`` (parameters beyond the sensor file's limits), ``_implausible``,
-        ``_not_in_uncertainty``, ``_not_held_out`` (why nothing was held out), ``_decided_by`` (the figure that
+        ``_not_in_uncertainty``, ``_not_held_out`` (why nothing was held out), ``_not_converged``,
+        ``_worse_than_raw`` (why the sensor is not calibrated then), ``_decided_by`` (the figure that
         decided the verdict); ``gyroscope_moves_over_noise`` (angle after held-out moves by hand); ``pass``;
         ``state`` ("ready", or the most urgent kind of problem, as on the campaign's page);
         ``left_out`` (rows that no fit uses); ``incomplete`` (stages after the fit that failed, and why); and other

@@ -22,6 +22,7 @@ from pipeline.core.files import INSTALLED, JSON, read_json, text_of_cell
 from pipeline.core.verdicts import (
     FAILED,
     KINDS,
+    NOT_CONVERGED,
     READY,
     SETTING,
     WITH_THEM,
@@ -47,7 +48,6 @@ NOT_TEXT = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}  # word
 UNSET: tuple[Any, ...] = (None, "", [], {})  # values of settings that a command leaves out
 EFFECTS_OVERRIDE = re.compile(r"effects\.(accelerometer|gyroscope)=(?:\[(.*)\]|.*)")
 OPEN = "effects that the recordings leave open (explain names them)"
-NOT_CONVERGED = "the fit did not converge: parameters and uncertainties are in doubt"
 DEFAULT_RESULTS = "results"  # the default folder of results
 
 
@@ -256,7 +256,7 @@ def _reasons(results: Path, units: Sequence[str]) -> list[str]:
                 "not_calibrated": lack and f"not calibrated: {lack}",
                 "not_held_out": (validation.get(sensor) or {}).get("reason"),
                 "not_determined": part.get("not_determined"),
-                "not_converged": None if part.get("converged", True) else NOT_CONVERGED,
+                NOT_CONVERGED: None if part.get("converged", True) else KINDS[NOT_CONVERGED].meaning,
             }
             for kind, doubt in doubts.items():
                 groups = kinds.setdefault(kind, {})

@@ -16,7 +16,8 @@ from pipeline.app.commands.explain import explain
 from pipeline.app.steps.calibration import judged
 from pipeline.core.files import write_json
 from pipeline.core.settings import Certificate, Stated
-from pipeline.output.outcome import outcome, read_summary
+from pipeline.core.verdicts import problems, state_of
+from pipeline.output.outcome import counted, outcome, problem_words, read_summary
 from pipeline.output.pages import campaign_page
 from pipeline.output.pages.certificate import certificate, certificate_page
 from pipeline.output.pages.chart import Figure, Panel, SampleMarks, chart
@@ -201,6 +202,20 @@ def test_parameters_beyond_the_data_sheet_are_shown_on_both_pages_and_in_the_sum
     assert "1 sensor with implausible parameters" in page.text
     assert "U , gyroscope: scale factor x" in page.text
     assert "outside the data sheet's limits" not in Text(campaign_page.render("bench", rows(unit, 2), [])).text
+
+
+def test_a_fit_that_did_not_converge_and_one_that_is_worse_than_the_readings_are_not_ready(unit: Unit) -> None:
+    stopped = unit.calibration | {"gyroscope": {**unit.calibration["gyroscope"], "converged": False}}
+    row = summary_row("U", stopped, unit.validation, unit.diagnosis, {})
+    assert "The fit did not converge" in Text(render(stopped, unit.validation, unit.diagnosis, [], unit.settings)).text
+    assert (next(iter(state_of(row).kinds)), row["accelerometer_not_converged"]) == ("not_converged", None)
+    assert counted([row]) == "1 unit: 0 ready, 1 not converged, 0 failed"
+    reason = "the held-out error is 2.1 times that of the raw readings"
+    harmful = unit.validation | {"gyroscope": {**unit.validation["gyroscope"], "worse_than_raw": reason}}
+    absent = unit.calibration | {"gyroscope": None, "not_calibrated": {"gyroscope": reason}}
+    row = summary_row("U", absent, harmful, unit.diagnosis, {})
+    assert (next(iter(state_of(row).kinds)), row["gyroscope_worse_than_raw"]) == ("worse_than_raw", reason)
+    assert "worse than raw: U; gyroscope" in problem_words(problems([row])[0])
 
 
 def test_every_place_counts_the_same_units_beyond_the_sensor_files_limits(unit: Unit, tmp_path: Path) -> None:

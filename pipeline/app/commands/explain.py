@@ -21,6 +21,7 @@ from pipeline.core.verdicts import (
     KINDS,
     MARK_ABOVE_FLOORS,
     MARK_AFTER_MOVES,
+    NOT_CONVERGED,
     Problem,
     Verdict,
     error_of,
@@ -33,7 +34,6 @@ from pipeline.evaluation.held_out.attitude import NO_HAND
 from pipeline.output.exports.reading import counts_of, explain_board, explain_calibration, read_any
 from pipeline.output.history import read_history
 from pipeline.output.outcome import (
-    NOT_CONVERGED,
     all_well,
     beyond_limits_groups,
     command_of,
@@ -250,7 +250,7 @@ def _notes(calibration: JSON) -> list[str]:
     lacks: list[dict[str, str | None]] = [
         {s: frame_words(part) for s, part in parts.items()},
         {s: part.get("not_determined") for s, part in parts.items()},
-        {s: "" if part.get("converged", True) else NOT_CONVERGED for s, part in parts.items()},
+        {s: "" if part.get("converged", True) else KINDS[NOT_CONVERGED].meaning for s, part in parts.items()},
     ]
     return notes + [f"{s.capitalize()}: {words}." for of_kind in lacks for s, words in of_kind.items() if words]
 

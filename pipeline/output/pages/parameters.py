@@ -34,7 +34,16 @@ from pipeline.core.records import (
     standard_uncertainty,
 )
 from pipeline.core.settings import DataSheet, Sensor
-from pipeline.core.verdicts import Verdict, error_of, moves_over_noise
+from pipeline.core.verdicts import (
+    IMPLAUSIBLE,
+    KINDS,
+    NOT_CONVERGED,
+    NOT_HELD_OUT,
+    WORSE_THAN_RAW,
+    Verdict,
+    error_of,
+    moves_over_noise,
+)
 from pipeline.estimation.candidates import is_fixed
 from pipeline.evaluation.diagnosis.words import plain
 from pipeline.output.pages.held_out_section import first_and_last_step, passes
@@ -45,7 +54,7 @@ SENSOR_COLUMNS = (
     "error_before", "error_after", "mean_abs_before", "mean_abs_after", "noise_floor", "verdict", "selected", "reason",
     "answers",
 )  # fmt: skip
-REMARK_KINDS = ("beyond_limits", "implausible", "not_in_uncertainty", "not_held_out")
+REMARK_KINDS = ("beyond_limits", IMPLAUSIBLE, "not_in_uncertainty", NOT_HELD_OUT, NOT_CONVERGED, WORSE_THAN_RAW)
 OF_CALIBRATION = tuple(f"{s}_{c}" for c in REMARK_KINDS for s in SENSORS)
 OF_UNIT = ("left_out", "incomplete")  # ``incomplete``: written by ``gather``, which knows what no stage could make
 # the error of the vector, where the attitude is known, the next step where the verdict is not ``nothing_missing``, and
@@ -210,6 +219,8 @@ def summary_row(
         row[f"{sensor}_beyond_limits"] = ";".join(e["parameter"] for e in beyond) or None
         row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) or None
         row[f"{sensor}_not_held_out"] = held_out.get("reason")
+        row[f"{sensor}_not_converged"] = None if (part or {}).get("converged", True) else KINDS[NOT_CONVERGED].meaning
+        row[f"{sensor}_worse_than_raw"] = held_out.get("worse_than_raw") if part is None else None
         vector = error_of(held_out)
         figures = vector[1:] if vector.kind == "vector" else (None,) * 3
         step = found.get("next_experiment") if found.get("verdict") != Verdict.NOTHING_MISSING else None
