@@ -74,10 +74,16 @@ def test_a_parameter_beyond_the_data_sheet_is_told(results: Path, capsys: pytest
 
 def test_what_the_rests_do_not_determine_is_told(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (results / "bench" / "calibrations").mkdir()
-    lack = {"accelerometer": None, "gyroscope": {"not_determined": "the rests do not determine it", "converged": False}}
+    reason = {"accelerometer": "no recording holds its readings"}
+    lack = {
+        "accelerometer": None,
+        "not_calibrated": reason,
+        "gyroscope": {"not_determined": "the rests do not determine it", "converged": False},
+    }
     (results / "bench" / "calibrations" / "U1.json").write_text(json.dumps(lack))
     main([str(results / "bench"), "U1"])
     told = capsys.readouterr().out
+    assert "  accelerometer\n    Not calibrated: no recording holds its readings.\n" in told
     assert "  Gyroscope: the rests do not determine it.\n" in told
     assert "  Gyroscope: the fit did not converge" in told
 

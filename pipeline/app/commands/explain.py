@@ -217,6 +217,7 @@ def explain(
         places = {s: place(part["verdict"]) if (part := document.get(s)) else len(Verdict) + 1 for s in SENSORS}
         ordered = sorted(SENSORS, key=places.__getitem__)  # first what can be added and what is in doubt
         words = {s: in_words(document.get(s), s) for s in ordered}
+        words |= {s: [f"Not calibrated: {why}."] for s, why in (calibration.get("not_calibrated") or {}).items()}
         units.append({
             "name": name,
             "words": {s: [w for w in w_ if limits or not w.startswith(UPPER_LIMITS)] for s, w_ in words.items()},
