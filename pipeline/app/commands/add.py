@@ -314,8 +314,8 @@ def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
     before = {unit: _published(results, unit) for unit in effects_of}
     code = run_snakemake(arguments, arguments.config)
     if code == 0:
-        told = shortened(changes_of(results, list(effects_of)), NAMED_PER_LINE, "sensors that changed")
-        print("\n".join(told or ["no sensor of these units has another error"]))
+        if not changes_of(results, list(effects_of)):  # else the lines of the run state them
+            print("no sensor of these units has another error")
         lines = [line for unit in effects_of for line in changed_files(unit, before[unit], _published(results, unit))]
         print("".join(f"{line}\n" for line in shortened(lines, NAMED_PER_LINE, "changes of files")), end="")
     return code
