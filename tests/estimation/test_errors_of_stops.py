@@ -14,8 +14,9 @@ from pipeline.app.one_unit import unit_row
 from pipeline.checks.bench import signed_axis
 from pipeline.core.records import Noise
 from pipeline.estimation.design import Design
-from pipeline.estimation.gauss_markov import Setting
+from pipeline.estimation.gauss_markov import Blocks, Products, Setting
 from pipeline.estimation.observations import Observations, observe, weighted
+from pipeline.estimation.table_errors import StopErrors
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "preprocessing"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "study"))
@@ -74,6 +75,43 @@ def test_products_and_estimates_are_those_of_the_dense_covariance() -> None:
         assert np.all(np.abs(by_map - by_matrix) < 0.01 * spread)
     one, two = (np.linalg.slogdet(sigma)[1] for sigma in dense)
     assert logarithms[1] - logarithms[0] == pytest.approx(two - one, abs=0.02)
+
+
+def test_bias_and_errors_at_stops_are_eliminated_as_by_dense_matrices_on_two_clocks_in_any_order() -> None:
+    rng, count, scale = np.random.default_rng(5), 12, np.array([0.5, 1.0, 2.0])
+    first, clock = np.array([0, 4, 5, 11, 17, 20, 30]), np.array([1, 1, 1, 0, 0, 0, 0])
+    weight, columns = rng.uniform(1.0, 5.0, 40), rng.normal(size=(40, 5))
+    start = np.array([3.0, 5.5, 9.0, 40.0, 7.0, 8.0, 21.0])  # on a shared clock, recordings follow in any order
+    blocks = Blocks(first, np.add.reduceat(weight, first), start, np.zeros(7), clock)
+    stop = np.sort(rng.integers(0, count - 1, 40))
+    before, after = rng.normal(size=(2, 40, 3)) * (rng.uniform(size=40) > 0.3)[:, None]
+    of_axis = [(np.array([0, 1, c + 2]), np.array([0, 1, c + 2])) for c in range(3)]
+    rows = Products(blocks, weight, columns)
+    stops = StopErrors(rows, before, after, stop, count)
+    sums = stops.sums(scale, of_axis, 5)
+    A, T = np.zeros((3, 40, 5)), np.zeros((3, 40, count))
+    for c, (local, place) in enumerate(of_axis):
+        A[c][:, place] = columns[:, local] / scale[c]
+        T[c, np.arange(40), stop] = before[:, c]
+        T[c, np.arange(40), stop + 1] += after[:, c]
+    label = blocks.label(40)
+    settings = [Setting(0.0, 1.0), Setting(0.02, 30.0), Setting(3.0, 500.0)]
+    dense = []
+    for setting in settings:
+        bias = setting.ratio**2 * blocks.covariance(setting.time)[np.ix_(label, label)]
+        known = np.vstack([*T])
+        dense.append(np.kron(np.eye(3), np.diag(1.0 / weight) + bias) + known @ known.T)
+    stacked = np.vstack([*A])
+    white = stacked.T @ (np.tile(weight, 3)[:, None] * stacked)
+    found, logarithms = stops.products(settings, white, sums)
+    expected = np.stack([stacked.T @ np.linalg.solve(sigma, stacked) for sigma in dense])
+    assert np.allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    determinants = np.array([np.linalg.slogdet(sigma)[1] for sigma in dense])
+    assert logarithms - logarithms[0] == pytest.approx(determinants - determinants[0], abs=1e-8)
+    for setting, sigma in zip(settings, dense, strict=True):
+        explained = np.vstack(stops.explained(setting, sums))
+        left = np.tile(weight, 3)[:, None] * stacked - np.linalg.solve(sigma, stacked)
+        assert np.allclose(explained, left, rtol=1e-8, atol=1e-8 * np.abs(left).max())
 
 
 def test_errors_of_the_angle_that_noise_hides_change_nothing() -> None:
