@@ -1,12 +1,13 @@
 """What one unit costs: ``python benchmarks/unit_cost.py --minutes 60 --rate 1000``.
 
 A unit of the demo, one by hand (faces and turns) and one that is mounted anew for each turn of a table are calibrated
-by ``pipeline.calibrate_unit`` in a warm process. The demo is run, and the CPU time of ``explain``, ``guide --help`` and ``add`` of one effect, with all of its processes,
-is divided by that of importing numpy, scipy, pydantic and pyarrow with the parts that calibrations use. Then three
-units on a table with long recordings are simulated, and each goes through every stage, page included, in a process of
-its own: with nothing hidden, with two hidden effects, and on a home-made table whose ripple leaves the
-sensors unexplained. Printed are CPU seconds, of a long unit for each stage, rows of the diagnosis, the largest memory
-and the verdicts. A long unit that needs more than ``--limit`` CPU seconds is ended.
+by ``pipeline.calibrate_unit`` in a warm process. The demo is run, and the CPU time of ``explain``, ``guide --help``
+and ``add`` of one effect, with all of its processes, is divided by that of importing numpy, scipy, pydantic and
+pyarrow with the parts that calibrations use. Then three units on a table with long recordings are simulated, and each
+goes through every stage, page included, in a process of its own: with nothing hidden, with two hidden effects, and on
+a home-made table whose ripple leaves the sensors unexplained. Printed are CPU seconds, of a long unit for each stage,
+rows of the diagnosis, the largest memory and the verdicts. A long unit that needs more than ``--limit`` CPU seconds
+is ended.
 """
 
 from __future__ import annotations
