@@ -149,14 +149,9 @@ def fit_terms(
         largest = small * np.sqrt(np.diag(solved.best_covariance))
         largest[BASE] = np.maximum(largest[BASE], 1e-12)
         converged = linear or bool(np.all(np.abs(taken) <= largest))
-        if converged and rounds > 1:
-            last, solved = solved.setting, _solve(design, observations, settings)
-            converged = solved.setting == last
         if not converged:
             design = design_at(observations, state)
-            solved = _solve(design, observations, [solved.setting])  # the others do not change the step
-    if not converged:
-        solved = _solve(design, observations, settings)
+            solved = _solve(design, observations, settings)
     residual = design.left(solved.step * converged)  # a step so small changes the columns by nothing that counts
     noise = observations.less_stop_errors
     squares = np.sum(noise.weight[:, None] * residual**2) + np.sum(noise.scatter)
