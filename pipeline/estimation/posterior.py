@@ -62,13 +62,13 @@ MOST_NEAR, SCALE_SEARCH_ITERATIONS = 16, 3
 CERTAIN = 0.97  # largest stated probability: of the inclusions with 1.000, 96.6 % were right in 738 sensors
 ANSWER_SET_PROBABILITY = 0.95  # probability of an answer set
 UPPER_LIMIT_SHARE = 29.0 / 30.0  # of an upper limit, see above: that of 0.95 was above the truth in 103 of 116
-# share of the best probability, above which a set is used for upper limits: with twice as much, 39 of 13,922 limits in 208
-# sensors of the blind study change by more than 1 % (at most 8 %), with half as much 57
+# share of the best probability, above which a set is used for upper limits: with twice as much, 39 of 13,922 limits in
+# 208 sensors of the blind study change by more than 1 % (at most 8 %), with half as much 57
 LIMIT_SET_SHARE = 0.05
 QUANTILE_ITERATIONS, QUANTILE_PRECISION = 40, 1e-6  # iterations for a quantile; their relative precision
 MAX_NORMAL_DEVIATIONS = 40.0  # standard deviations: beyond them the normal distribution is 0 or 1 in doubles
-# probability of the sets with the same other timing effects, above which these are fitted; with half of it nothing changes
-# in these sensors
+# probability of the sets with the same other timing effects, above which these are fitted; with half of it nothing
+# changes in these sensors
 WORTH_A_FIT = 0.01
 MOST_FITS = 3  # of other timing effects
 LEAST_LAG_S = 1e-4  # a smaller lag has the column of a time offset, whose sign is free

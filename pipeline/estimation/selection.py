@@ -43,8 +43,8 @@ MAX_SELECTED_EFFECTS = 5  # effects that one selection adds
 INFLATED = 3.0  # times the expected wander, see above
 EVIDENCE = 5.0  # difference in log L: a Bayes factor of 150, "very strong" (Kass and Raftery, JASA 90, 1995)
 LOOK_ALIKE_SHARE = 0.8  # share of an effect's signal that another reproduces, above which it is a look-alike
-# ``MOVER_SHARE``, ``CONSTANT_SHARE``, ``TIE``, ``WORTH_NAMING``, ``ANOTHER_K``: halved together they change nothing in 208
-# sensors of the blind study (four of each family); doubled, the order of one selection and one verdict.
+# ``MOVER_SHARE``, ``CONSTANT_SHARE``, ``TIE``, ``WORTH_NAMING``, ``ANOTHER_K``: halved together they change nothing in
+# 208 sensors of the blind study (four of each family); doubled, the order of one selection and one verdict.
 MOVER_SHARE = 0.1  # of the best candidate's delta BIC above which an effect of timing is fitted to its optimum
 CONSTANT_SHARE = 0.6  # the same for an effect with a time constant, whose start is near its optimum
 DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is selected unless the second is clearly better
